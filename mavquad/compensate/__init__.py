@@ -1,0 +1,1 @@
+"""Compensators: correct the command of any nominal controller."""

@@ -1,0 +1,1 @@
+"""Controllers: from an estimate and a demand to a command."""

@@ -1,0 +1,1 @@
+"""Observers: from samples to states, rates and disturbances."""

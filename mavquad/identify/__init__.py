@@ -1,0 +1,1 @@
+"""From flight records to models with error bars."""

@@ -1,0 +1,1 @@
+"""The simulated autopilot: a program of its own, met over MAVLink only."""
