@@ -1,0 +1,126 @@
+"""Airframes: plain numbers of one vehicle, read from `airframes/*.toml`. Each side computes its own mixer from them."""
+
+from pathlib import Path
+from typing import Literal
+
+from mavquad import config
+from mavquad.errors import ConfigError
+
+Vec3 = tuple[float, float, float]
+FOLDER = Path(__file__).resolve().parent / "airframes"
+
+
+class Body(config.Section):
+    """Mass and inertia about the centre of mass, body axes (FRD)."""
+
+    mass_kg: float
+    inertia_kg_m2: Vec3
+
+
+class Rotors(config.Section):
+    """Four rotors in one plane. Numbering: x: 1 front right, 2 rear left, 3 front left, 4 rear right (1, 2 turn CCW seen from
+    above); plus: 1 front, 2 right, 3 rear, 4 left (2, 4 turn CCW)."""
+
+    layout: Literal["x", "plus"]
+    arm_m: float
+    thrust_max_n: float
+    torque_per_thrust_m: float
+    lag_s: float
+    thrust_min_n: float = 0.0
+
+
+class Drag(config.Section):
+    """Force against the air-relative body velocity: -(linear + quadratic |v|) v, per axis."""
+
+    linear_n_s_m: Vec3 = (0.0, 0.0, 0.0)
+    quadratic_n_s2_m2: Vec3 = (0.0, 0.0, 0.0)
+
+
+class AttitudeResponse(config.Section):
+    """The autopilot's answer from attitude setpoint to attitude: gain wn^2/(s^2 + 2 zeta wn s + wn^2) after a delay."""
+
+    natural_frequency_rad_s: float
+    damping: float
+    delay_s: float = 0.0
+    gain: float = 1.0
+
+    @property
+    def lag_s(self) -> float:
+        """The first-order lag with the same slope of phase at low frequency, delay not included: 2 zeta/wn."""
+        return 2.0 * self.damping / self.natural_frequency_rad_s
+
+
+class Airframe(config.Section):
+    """One vehicle. `hover_thrust` is the collective 0..1 that carries it in still air."""
+
+    name: str
+    body: Body
+    attitude: AttitudeResponse
+    hover_thrust: float
+    kind: Literal["quadrotor", "helicopter"] = "quadrotor"
+    rotors: Rotors | None = None
+    drag: Drag = Drag()
+
+    def __post_init__(self) -> None:
+        mass, inertia = self.body.mass_kg, self.body.inertia_kg_m2
+        if not 0.01 <= mass <= 1000.0:
+            raise ConfigError(f"body.mass_kg = {mass}: expected 0.01 to 1000 kg")
+        if min(inertia) <= 0.0:
+            raise ConfigError(f"body.inertia_kg_m2 = {list(inertia)}: every axis must be > 0")
+        a, b, c = sorted(inertia)
+        if c > a + b + 1e-12:
+            raise ConfigError(
+                f"body.inertia_kg_m2 = {list(inertia)}: no body has one axis above the sum of the two others ({a + b:.4g})"
+            )
+        if self.kind == "quadrotor":
+            if self.rotors is None:
+                raise ConfigError(
+                    "[rotors] is missing: a quadrotor needs layout, arm_m, thrust_max_n, torque_per_thrust_m, lag_s"
+                )
+            self._check_rotors(self.rotors)
+        if not 0.05 <= self.hover_thrust <= 0.95:
+            raise ConfigError(f"hover_thrust = {self.hover_thrust}: expected 0.05 to 0.95 of full collective")
+        if (
+            self.attitude.natural_frequency_rad_s <= 0.0
+            or self.attitude.damping <= 0.0
+            or not 0.0 <= self.attitude.delay_s <= 1.0
+        ):
+            raise ConfigError(
+                f"[attitude] = {self.attitude}: expected natural_frequency_rad_s > 0, damping > 0, delay_s 0 to 1"
+            )
+
+    def _check_rotors(self, r: Rotors) -> None:
+        bound = self.body.mass_kg * r.arm_m**2
+        jx, jy, jz = self.body.inertia_kg_m2
+        if max(jx, jy) > 0.5 * bound or jz > bound:
+            raise ConfigError(
+                f"body.inertia_kg_m2 = {[jx, jy, jz]}: impossible for {self.body.mass_kg} kg on arms of {r.arm_m} m:"
+                f" at most m l^2/2 = {0.5 * bound:.4g} (roll, pitch) and m l^2 = {bound:.4g} (yaw)"
+            )
+        if 4.0 * r.thrust_max_n <= 1.1 * self.body.mass_kg * 9.80665:
+            raise ConfigError(
+                f"rotors.thrust_max_n = {r.thrust_max_n}: four of them must lift at least 1.1 times the weight"
+                f" ({1.1 * self.body.mass_kg * 9.80665 / 4.0:.3g} N each)"
+            )
+        if (
+            min(r.arm_m, r.torque_per_thrust_m) <= 0.0
+            or not 0.0 <= r.lag_s <= 1.0
+            or not 0.0 <= r.thrust_min_n < r.thrust_max_n
+        ):
+            raise ConfigError(
+                f"[rotors] = {r}: expected arm_m, torque_per_thrust_m > 0, lag_s 0 to 1, 0 <= thrust_min_n < thrust_max_n"
+            )
+
+
+def load(name_or_path: str, overrides: tuple[str, ...] = ()) -> Airframe:
+    """An airframe by its name (one of ours) or by a path to a TOML file; overrides as in `config.override`."""
+    path = Path(name_or_path)
+    if path.suffix != ".toml":
+        path = FOLDER / f"{name_or_path}.toml"
+        if not path.is_file():
+            known = ", ".join(sorted(p.stem for p in FOLDER.glob("*.toml")))
+            raise ConfigError(f"no airframe is called {name_or_path!r}; known: {known}; or give a path that ends in .toml")
+    data = config.read(path)
+    for assignment in overrides:
+        data = config.override(data, assignment)
+    return config.convert(data, Airframe, str(path))

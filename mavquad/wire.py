@@ -1,0 +1,218 @@
+"""MAVLink frames <-> named tuples: framing, CRC, signing. No units, frames of reference or signs.
+
+Every table comes from pymavlink's own message classes (dialect `ardupilotmega`, a superset of `common`): any message it
+knows is coded, nothing is typed by hand. A message is a NamedTuple of fields in MAVLink's declared order; arrays are tuples, texts
+are `str` cut at the first NUL.
+
+Source: MAVLink serialisation and signing, https://mavlink.io/en/guide/serialization.html, .../message_signing.html
+"""
+
+import hashlib
+import struct
+from collections import namedtuple
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+from fastcrc.crc16 import mcrf4xx
+from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from mavquad.errors import WireError
+
+STX_V1 = 0xFE
+STX_V2 = 0xFD
+SIGNED = 0x01  # incompatibility flag
+SIGNATURE_LENGTH = 13
+MAX_FRAME = 10 + 255 + 2 + SIGNATURE_LENGTH
+_HEADER_V2 = struct.Struct("<BBBBBBBHB")
+
+
+class Frame(NamedTuple):
+    """One frame whose CRC is right, still as bytes."""
+
+    raw: bytes
+    msgid: int
+    system: int
+    component: int
+    seq: int
+
+
+class Spec:
+    """How one message is laid out; `make(*fields)` is its NamedTuple."""
+
+    __slots__ = ("_arrays", "_extra", "_order", "_rank", "_texts", "crc_extra", "length", "make", "msgid", "name", "struct")
+
+    def __init__(self, cls: Any) -> None:
+        self.msgid: int = cls.id
+        self.name: str = cls.msgname
+        self.crc_extra: int = cls.crc_extra
+        self._extra = bytes([cls.crc_extra])
+        self.struct = struct.Struct(cls.unpacker.format)
+        self.length = self.struct.size
+        self.make: Callable[..., Any] = namedtuple(cls.msgname, cls.fieldnames)
+        wire_names = list(cls.ordered_fieldnames)
+        self._order = tuple(wire_names.index(name) for name in cls.fieldnames)  # declared position -> wire position
+        self._rank = tuple(cls.fieldnames.index(name) for name in wire_names)  # wire position -> declared position
+        self._texts = tuple(
+            i
+            for i, name in enumerate(cls.fieldnames)
+            if cls.fieldtypes[i] == "char" and cls.array_lengths[wire_names.index(name)]
+        )
+        # only numeric arrays spread over several struct items; a text is one
+        self._arrays: tuple[int, ...] | None = tuple(cls.lengths) if any(n > 1 for n in cls.lengths) else None
+
+    def unpack(self, payload: bytes) -> Any:
+        """The message from its payload, zero-extended where the sender trimmed it."""
+        if len(payload) < self.length:
+            payload = payload.ljust(self.length, b"\0")
+        items: Any = self.struct.unpack_from(payload)
+        if self._arrays is not None:
+            grouped, at = [], 0
+            for n in self._arrays:
+                grouped.append(items[at] if n == 1 else items[at : at + n])
+                at += n
+            items = grouped
+        if not self._texts:
+            return self.make(*[items[i] for i in self._order])
+        fields = [items[i] for i in self._order]
+        for i in self._texts:
+            fields[i] = fields[i].split(b"\0", 1)[0].decode("utf-8", "replace")
+        return self.make(*fields)
+
+    def pack(self, fields: tuple[Any, ...]) -> bytes:
+        """The payload, untrimmed. Raises WireError where a field does not fit its type."""
+        try:
+            if not self._texts and self._arrays is None:
+                return self.struct.pack(*[fields[i] for i in self._rank])
+            items: list[Any] = []
+            for at, i in enumerate(self._rank):
+                value = fields[i]
+                if i in self._texts:
+                    items.append(value.encode() if isinstance(value, str) else value)
+                elif self._arrays is not None and self._arrays[at] > 1:
+                    items.extend(value)
+                else:
+                    items.append(value)
+            return self.struct.pack(*items)
+        except (struct.error, IndexError, TypeError, OverflowError) as error:
+            raise WireError(f"{self.name}{tuple(fields)!r} does not fit its layout {self.struct.format}: {error}") from None
+
+
+class _Specs(dict[int, Spec]):
+    """Message id -> Spec, made when first asked for."""
+
+    def __missing__(self, msgid: int) -> Spec:
+        cls = dialect.mavlink_map.get(msgid)
+        if cls is None:
+            raise KeyError(msgid)
+        spec = Spec(cls)
+        self[msgid] = spec
+        return spec
+
+
+SPECS = _Specs()
+ID: dict[str, int] = {cls.msgname: msgid for msgid, cls in dialect.mavlink_map.items()}
+NAME: dict[int, str] = {msgid: name for name, msgid in ID.items()}
+
+
+def spec(name: str) -> Spec:
+    """The layout of a message by its name. Raises WireError for a name no dialect knows."""
+    try:
+        return SPECS[ID[name]]
+    except KeyError:
+        raise WireError(f"no MAVLink message is called {name!r}; names are as in common.xml, e.g. 'ATTITUDE'") from None
+
+
+def encode(name: str, fields: tuple[Any, ...], *, seq: int, system: int, component: int) -> bytes:
+    """One unsigned MAVLink 2 frame. Raises WireError where the fields do not fit."""
+    s = spec(name)
+    payload = s.pack(fields).rstrip(b"\0") or b"\0"
+    msgid = s.msgid
+    body = _HEADER_V2.pack(STX_V2, len(payload), 0, 0, seq & 0xFF, system, component, msgid & 0xFFFF, msgid >> 16) + payload
+    return body + mcrf4xx(body[1:] + s._extra).to_bytes(2, "little")
+
+
+def split(data: bytes) -> tuple[list[Frame], int, bytes]:
+    """Whole frames in `data`, the number of bytes refused, and the rest that may be the beginning of a frame.
+
+    A known message with a wrong CRC is refused byte by byte, so that a frame behind junk is still found. One of an unknown
+    id cannot be checked: it is passed on (`decode` will say that it is unknown).
+    """
+    frames: list[Frame] = []
+    refused = at = 0
+    size = len(data)
+    while at < size:
+        stx = data[at]
+        if stx == STX_V2:
+            if size - at < 10:
+                break
+            end = at + 12 + data[at + 1] + (SIGNATURE_LENGTH if data[at + 2] & SIGNED else 0)
+            if data[at + 2] & ~SIGNED:  # flags that nobody understands: the frame must not be taken
+                at, refused = at + 1, refused + 1
+                continue
+            if end > size:
+                break
+            crc_at = at + 10 + data[at + 1]
+            msgid = data[at + 7] | data[at + 8] << 8 | data[at + 9] << 16
+            system, component, seq = data[at + 5], data[at + 6], data[at + 4]
+        elif stx == STX_V1:
+            if size - at < 6:
+                break
+            end = at + 8 + data[at + 1]
+            if end > size:
+                break
+            crc_at = end - 2
+            msgid, system, component, seq = data[at + 5], data[at + 3], data[at + 4], data[at + 2]
+        else:
+            at, refused = at + 1, refused + 1
+            continue
+        if msgid in ID_SET:
+            expected = mcrf4xx(data[at + 1 : crc_at] + SPECS[msgid]._extra)
+            if data[crc_at] | data[crc_at + 1] << 8 != expected:
+                at, refused = at + 1, refused + 1
+                continue
+        frames.append(Frame(data[at:end], msgid, system, component, seq))
+        at = end
+    return frames, refused, data[at:]
+
+
+ID_SET = frozenset(ID.values())
+
+
+def decode(frame: Frame) -> Any:
+    """The message of a frame as its NamedTuple (class name = message name). Raises WireError for an unknown id."""
+    try:
+        s = SPECS[frame.msgid]
+    except KeyError:
+        raise WireError(f"message id {frame.msgid} from {frame.system}/{frame.component} is in no known dialect") from None
+    raw = frame.raw
+    return s.unpack(raw[10 : 10 + raw[1]] if raw[0] == STX_V2 else raw[6 : 6 + raw[1]])
+
+
+def parse(data: bytes) -> Iterator[tuple[Frame, Any]]:
+    """(frame, message) of every known whole frame in a datagram; the rest is left out."""
+    for frame in split(data)[0]:
+        if frame.msgid in ID_SET:
+            yield frame, decode(frame)
+
+
+# ---- signing ------------------------------------------------------------------------------------------------------------
+def sign(raw: bytes, key: bytes, link_id: int, timestamp_10us: int) -> bytes:
+    """A signed copy of an unsigned MAVLink 2 frame: key (32,) bytes, timestamp in 10 us since 2015-01-01."""
+    head = raw[:2] + bytes([raw[2] | SIGNED]) + raw[3:-2]
+    checked = head + mcrf4xx(head[1:] + SPECS[int.from_bytes(raw[7:10], "little")]._extra).to_bytes(2, "little")
+    tail = bytes([link_id]) + timestamp_10us.to_bytes(6, "little")
+    return checked + tail + hashlib.sha256(key + checked + tail).digest()[:6]
+
+
+def is_signed(frame: Frame) -> bool:
+    return frame.raw[0] == STX_V2 and bool(frame.raw[2] & SIGNED)
+
+
+def verify(frame: Frame, key: bytes) -> tuple[int, int] | None:
+    """(link id, timestamp in 10 us) of a frame whose signature the key made, else None."""
+    if not is_signed(frame):
+        return None
+    body, signature = frame.raw[:-6], frame.raw[-6:]
+    if hashlib.sha256(key + body).digest()[:6] != signature:
+        return None
+    return body[-7], int.from_bytes(body[-6:], "little")
