@@ -1,0 +1,114 @@
+"""Scenarios: all resolve, --set goes where it means, mistakes name file and key, TOML written is TOML read."""
+
+import math
+import tomllib
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mavquad.errors import ConfigError
+from tools import scenarios, toml
+
+
+@pytest.mark.parametrize("name", scenarios.names())
+def test_every_scenario_resolves_with_the_standard_conditions(name):
+    resolved = scenarios.resolve(scenarios.load(name), scenarios.Options(seed=7))
+    assert resolved.sitl["noise"]["position_m"] == 0.02
+    assert resolved.sitl["link"]["delay_ms"] == 5.0
+    assert resolved.sitl["seed"] == 7
+    assert resolved.companion["takeoff_m"] == 5.0
+    assert resolved.companion["path"]["name"] == ("circle" if name == "gusty" else name)
+
+
+def test_the_standard_scenarios_are_those_of_the_architecture():
+    assert scenarios.names() == ["circle", "ellipse", "gusty", "hover", "line", "rectangle", "spiral"]
+    gusty = scenarios.resolve(scenarios.load("gusty"), scenarios.Options()).sitl
+    assert gusty["overrides"] == ["body.mass_kg=+20%"]
+    assert (gusty["wind"]["mean_m_s"], gusty["wind"]["w20_m_s"], gusty["wind"]["gusts"][0]["speed_m_s"]) == (5.0, 8.0, 6.0)
+
+
+def test_set_reaches_the_vehicle_the_simulator_and_the_companion():
+    changes = [
+        "vehicle.mass=+20%",
+        "vehicle.body.inertia_kg_m2=+5%",
+        "wind.mean_m_s=4",
+        "noise.position_m=+50%",
+        "path.radius_m=2.5",
+        "limits.tilt_deg=30",
+        "companion.rate=1",
+        "flight.takeoff_m=8",
+    ]
+    with pytest.raises(ConfigError, match="wind"):
+        scenarios.load("circle", ["windd.x.y"])
+    _, sitl, companion = scenarios.resolve(
+        scenarios.load("circle", changes), scenarios.Options(controller="pd", observers=["gsmo"])
+    )
+    assert sitl["overrides"] == ["body.mass_kg=+20%", "body.inertia_kg_m2=+5%"]
+    assert sitl["wind"]["mean_m_s"] == 4
+    assert sitl["noise"]["position_m"] == pytest.approx(0.03)
+    assert companion["path"]["radius_m"] == 2.5
+    assert companion["limits"] == {"tilt_deg": 30}
+    assert companion["rate"] == 1
+    assert companion["takeoff_m"] == 8
+    assert (companion["controller"], companion["observers"]) == ("pd", ["gsmo"])
+    assert "estimator" not in companion
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "says"),
+    [
+        ("circel", [], "known: circle"),
+        ("circle", ["mass"], "TABLE.KEY=VALUE"),
+        ("circle", ["flight.takeof_m=3"], 'did you mean "takeoff_m"'),
+        ("circle", ["flight.takeoff_m=-3"], "0.5 to 500"),
+        ("circle", ["noise.positon_m=+5%"], 'did you mean "position_m"'),
+        ("circle", ["require.rmse_m=fast"], "require.rmse_m = 'fast'"),
+    ],
+)
+def test_a_mistake_says_what_and_where(name, changes, says):
+    with pytest.raises(ConfigError) as error:
+        scenarios.load(name, changes)
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_an_impossible_vehicle_and_a_missing_file_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match="mass_kg = -2"):
+        scenarios.resolve(scenarios.load("circle", ["vehicle.mass=-2"]), scenarios.Options())
+    with pytest.raises(ConfigError, match="did you mean"):
+        scenarios.resolve(scenarios.load("circle", ["vehicle.body.mas_kg=+20%"]), scenarios.Options())
+    with pytest.raises(ConfigError, match=r"own\.toml: no such file"):
+        scenarios.load(str(tmp_path / "own.toml"))
+    own = tmp_path / "own.toml"
+    own.write_text('about = "mine"\n[path]\nname = "hover"\n[wind]\nmean_m_s = 3.0\n')
+    assert scenarios.load(str(own)).wind["mean_m_s"] == 3.0
+    own.write_text('about = "mine"\npth = 1\n[path]\nname = "hover"\n')
+    with pytest.raises(ConfigError, match=r'own\.toml: unknown key "pth"; did you mean "path"'):
+        scenarios.load(str(own))
+
+
+scalars = st.one_of(st.booleans(), st.integers(-(2**62), 2**62), st.floats(), st.text(max_size=20))
+values = st.recursive(scalars, lambda v: st.lists(v, max_size=3), max_leaves=6)
+tables = st.dictionaries(st.text(max_size=6), st.one_of(values, st.dictionaries(st.text(max_size=6), values, max_size=3)))
+
+
+def _same(a, b):
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(_same(a[k], b[k]) for k in a)
+    if isinstance(a, list):
+        return len(a) == len(b) and all(map(_same, a, b))
+    return (type(a) is type(b) and a == b) or (isinstance(a, float) and math.isnan(a) and math.isnan(b))
+
+
+@given(tables)
+def test_toml_written_is_toml_read_to_the_last_bit(data):
+    assert _same(data, tomllib.loads(toml.dumps(data)))
+
+
+def test_toml_of_lists_of_tables_and_of_nothing():
+    data = {"gusts": [{"t_s": 1.0, "about": 'a\n"b"'}], "empty": {}, "deep": {"er": {"x": [1, 2]}}}
+    assert tomllib.loads(toml.dumps(data)) == data
+    assert toml.dumps({"a": None}) == ""
+    with pytest.raises(ConfigError, match="set"):
+        toml.dumps({"a": {1, 2}})
