@@ -1,0 +1,123 @@
+"""MAVLink fields <-> signals: units and frames change here and nowhere else.
+
+One function per message, one table. A message is taken whole or refused whole (LinkError).
+"""
+
+import math
+import struct
+from collections.abc import Callable
+from typing import Any
+
+from mavquad.errors import LinkError
+from mavquad.signals import Attitude, Imu, Mocap, Motors, Position, Quat, Setpoint, Target
+
+Sample = Attitude | Imu | Mocap | Motors | Position | Target
+_SERVO_WRAP_US = 1 << 32
+
+
+def _unit(name: str, stamp: str, w: float, x: float, y: float, z: float) -> Quat:
+    n2 = w * w + x * x + y * y + z * z
+    if not 0.9 < n2 < 1.1:  # also NaN
+        raise LinkError(
+            f"{name} at {stamp} has |q| = {math.sqrt(n2) if n2 >= 0 else n2:.4f}, expected 1 +/- 0.05; sample refused"
+        )
+    k = 1.0 / math.sqrt(n2)
+    return (k * w, k * x, k * y, k * z)
+
+
+def _finite(name: str, stamp: str, *values: float) -> None:
+    for value in values:
+        if not math.isfinite(value):
+            raise LinkError(f"{name} at {stamp} holds {value}, expected finite numbers; sample refused")
+
+
+def attitude_quaternion(m: Any) -> Attitude:
+    """ATTITUDE_QUATERNION (#31): ms -> us; rates already rad/s in FRD."""
+    stamp = f"{m.time_boot_ms} ms"
+    _finite("ATTITUDE_QUATERNION", stamp, m.rollspeed, m.pitchspeed, m.yawspeed)
+    q = _unit("ATTITUDE_QUATERNION", stamp, m.q1, m.q2, m.q3, m.q4)
+    return Attitude(1000 * m.time_boot_ms, q, (m.rollspeed, m.pitchspeed, m.yawspeed))
+
+
+def attitude(m: Any) -> Attitude:
+    """ATTITUDE (#30): ZYX Euler angles."""
+    _finite("ATTITUDE", f"{m.time_boot_ms} ms", m.roll, m.pitch, m.yaw, m.rollspeed, m.pitchspeed, m.yawspeed)
+    cr, sr = math.cos(0.5 * m.roll), math.sin(0.5 * m.roll)
+    cp, sp = math.cos(0.5 * m.pitch), math.sin(0.5 * m.pitch)
+    cy, sy = math.cos(0.5 * m.yaw), math.sin(0.5 * m.yaw)
+    q = (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+    return Attitude(1000 * m.time_boot_ms, q, (m.rollspeed, m.pitchspeed, m.yawspeed))
+
+
+def mocap(m: Any) -> Mocap:
+    """ATT_POS_MOCAP (#138): already us, NED, FRD."""
+    stamp = f"{m.time_usec} us"
+    _finite("ATT_POS_MOCAP", stamp, m.x, m.y, m.z)
+    return Mocap(m.time_usec, _unit("ATT_POS_MOCAP", stamp, *m.q), (m.x, m.y, m.z))
+
+
+def imu(m: Any) -> Imu:
+    """HIGHRES_IMU (#105): us, m/s^2, rad/s, FRD. Its magnetometer is not used."""
+    _finite("HIGHRES_IMU", f"{m.time_usec} us", m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro)
+    return Imu(m.time_usec, (m.xacc, m.yacc, m.zacc), (m.xgyro, m.ygyro, m.zgyro))
+
+
+def position(m: Any) -> Position:
+    """LOCAL_POSITION_NED (#32): ms -> us; metres, m/s."""
+    _finite("LOCAL_POSITION_NED", f"{m.time_boot_ms} ms", m.x, m.y, m.z, m.vx, m.vy, m.vz)
+    return Position(1000 * m.time_boot_ms, (m.x, m.y, m.z), (m.vx, m.vy, m.vz))
+
+
+def motors(m: Any) -> Motors:
+    """SERVO_OUTPUT_RAW (#36): PWM 1000..2000 us of the first four outputs -> 0..1. Its stamp is 32 bits of us: it wraps."""
+    pwm = (m.servo1_raw, m.servo2_raw, m.servo3_raw, m.servo4_raw)
+    return Motors(m.time_usec, tuple(min(1.0, max(0.0, 1e-3 * (x - 1000))) for x in pwm))
+
+
+def target(m: Any) -> Target:
+    """ATTITUDE_TARGET (#83): the attitude setpoint the autopilot acts on."""
+    stamp = f"{m.time_boot_ms} ms"
+    _finite("ATTITUDE_TARGET", stamp, m.thrust)
+    q = _unit("ATTITUDE_TARGET", stamp, *m.q)
+    return Target(1000 * m.time_boot_ms, q, (m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate), m.thrust, m.type_mask)
+
+
+DECODERS: dict[str, Callable[[Any], Sample]] = {
+    "ATTITUDE_QUATERNION": attitude_quaternion,
+    "ATTITUDE": attitude,
+    "ATT_POS_MOCAP": mocap,
+    "HIGHRES_IMU": imu,
+    "LOCAL_POSITION_NED": position,
+    "SERVO_OUTPUT_RAW": motors,
+    "ATTITUDE_TARGET": target,
+}
+
+
+def unwrap_us(stamp_us: int, reference_us: int) -> int:
+    """A 32-bit microsecond stamp (it wraps after 71.6 minutes) as the full stamp nearest to a reference."""
+    turns = (reference_us - stamp_us + _SERVO_WRAP_US // 2) // _SERVO_WRAP_US
+    return stamp_us + turns * _SERVO_WRAP_US
+
+
+def attitude_setpoint(time_boot_ms: int, system: int, component: int, setpoint: Setpoint) -> tuple[Any, ...]:
+    """Fields of SET_ATTITUDE_TARGET (#82)."""
+    w = setpoint.omega_rad_s
+    rates = (0.0, 0.0, 0.0) if setpoint.type_mask & 7 == 7 else w
+    return (time_boot_ms, system, component, setpoint.type_mask, setpoint.q_wxyz, *rates, setpoint.thrust, (0.0, 0.0, 0.0))
+
+
+def float_of_int(value: int, kind: int) -> float:
+    """An integer parameter byte-wise in the float, as PX4 sends it (MAV_PARAM_TYPE 1..6)."""
+    code = {1: "<B3x", 2: "<b3x", 3: "<H2x", 4: "<h2x", 5: "<I", 6: "<i"}.get(kind, "<i")
+    return struct.unpack("<f", struct.pack(code, value))[0]  # type: ignore[no-any-return]
+
+
+def int_of_float(value: float, kind: int) -> int:
+    """The integer that PX4 put byte-wise into a float parameter (MAV_PARAM_TYPE 1..6)."""
+    code = {1: "<B3x", 2: "<b3x", 3: "<H2x", 4: "<h2x", 5: "<I", 6: "<i"}.get(kind, "<i")
+    return struct.unpack(code, struct.pack("<f", value))[0]  # type: ignore[no-any-return]
