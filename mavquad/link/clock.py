@@ -13,3 +13,8 @@ def wall_us() -> int:
 def monotonic_s() -> float:
     """Seconds of a clock that never steps, for time-outs."""
     return time.monotonic()
+
+
+def stamp() -> str:
+    """Local date and time for a folder's name."""
+    return time.strftime("%Y%m%d-%H%M%S")

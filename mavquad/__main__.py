@@ -1,0 +1,60 @@
+"""python -m mavquad: the companion alone."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+from mavquad.errors import MavquadError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The companion's options."""
+    parser.add_argument(
+        "--endpoint",
+        default="udpin:0.0.0.0:14540",
+        help="udpin:, udpout:, tcp:HOST:PORT or serial:DEVICE:BAUD (default: %(default)s)",
+    )
+    parser.add_argument("--config", type=Path, help="a companion.toml; without one: the defaults, hovering where it is")
+    parser.add_argument("--run", type=Path, help="folder for the logs (default: runs/<time>-companion)")
+    parser.add_argument("--engage", action="store_true", help="take off and fly the path as soon as the autopilot is ready")
+    parser.add_argument(
+        "--lockstep", action="store_true", help="vehicle time waits for us (the simulated autopilot must be started so too)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fly until Ctrl-C or SIGTERM; one line of JSON about it on stdout at the end."""
+    from mavquad import config, pipeline, settings
+    from mavquad.companion import Companion
+    from mavquad.link import clock
+    from mavquad.link.endpoint import open_endpoint
+
+    chosen = config.load(args.config, settings.Companion) if args.config else settings.Companion()
+    plan = pipeline.build(chosen)
+    folder = args.run or Path("runs") / f"{clock.stamp()}-companion"
+    companion = Companion(plan, open_endpoint(args.endpoint), folder, lockstep=args.lockstep, engage=args.engage)
+    try:
+        companion.run()
+    finally:
+        print(json.dumps(companion.summary()), flush=True)
+    return 0
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Parse, run, and print an error as one line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m mavquad",
+        description="The companion: listens to an autopilot, estimates, and flies it on request.",
+        epilog="example: python -m mavquad --endpoint udpin:0.0.0.0:14540 --config companion.toml",
+    )
+    add_arguments(parser)
+    try:
+        return run(parser.parse_args(argv))
+    except MavquadError as error:
+        print(f"mavquad: {error}", file=sys.stderr)
+        return 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,316 @@
+"""The live shell: endpoint + clock + pipeline + log. It owns everything that ages; nothing below it asks whether it is live.
+
+Every accepted frame is logged before it is acted on, every sent frame before it is sent. In lockstep the clock is the barrier:
+all frames of a period carry its stamp (architecture, section 3).
+"""
+
+import json
+import math
+import os
+import signal
+import struct
+import sys
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from mavquad import lifecycle, pipeline, wire
+from mavquad.errors import FlightError
+from mavquad.link import clock, health
+from mavquad.link.endpoint import Address, Endpoint
+from mavquad.link.tlog import Writer
+from mavquad.pipeline import Flight, Plan
+from mavquad.wire import Frame
+
+_MAX_DATAGRAM = 1400
+_LOCKSTEP_WAIT_S = 10.0
+_SILENCE_S = 5.0
+_MOVED_S = 3.0  # an autopilot silent for so long may come back from another address
+_TIMESYNC = wire.ID["TIMESYNC"]
+_SETPOINTS = frozenset((wire.ID["SET_ATTITUDE_TARGET"], wire.ID["SET_POSITION_TARGET_LOCAL_NED"]))
+
+
+class TraceWriter:
+    """`flight.trace`: a line of JSON with the column names, then rows of little-endian float64."""
+
+    def __init__(self, path: Path, names: tuple[str, ...]) -> None:
+        self._file = path.open("xb")
+        self._file.write(json.dumps(names).encode() + b"\n")
+        self._row = struct.Struct(f"<{len(names)}d")
+
+    def write(self, row: tuple[float, ...]) -> None:
+        self._file.write(self._row.pack(*row))
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def request(number: int, plan: Plan, seq: int) -> Frame:
+    """A local request (engage, land) as the frame it enters by, as if from a ground station."""
+    own = plan.settings.link
+    fields = (own.system, own.component, number, 0, *(0.0,) * 7)
+    raw = wire.encode("COMMAND_LONG", fields, seq=seq, system=255, component=190)
+    return wire.split(raw)[0][0]
+
+
+def next_log(run: Path, stem: str) -> Path:
+    """flight.tlog, or flight-2.tlog for a companion that was started again in the same folder."""
+    path, n = run / f"{stem}.tlog", 1
+    while path.exists():
+        n += 1
+        path = run / f"{stem}-{n}.tlog"
+    return path
+
+
+class Companion:
+    """One companion on one endpoint."""
+
+    def __init__(self, plan: Plan, endpoint: Endpoint, run: Path, lockstep: bool = False, engage: bool = False) -> None:
+        run.mkdir(parents=True, exist_ok=True)
+        self.plan = plan
+        self.endpoint = endpoint
+        self.lockstep = lockstep
+        self.flight: Flight = pipeline.start(plan)
+        path = next_log(run, "flight")
+        self.log = Writer(path)
+        self.trace = TraceWriter(path.with_suffix(".trace"), plan.trace_names)
+        self._refused_path = run / path.name.replace("flight", "refused")
+        self._refused: Writer | None = None
+        self.refused: dict[str, int] = {}
+        self._engage = engage
+        self._stop = False
+        self._stamp_us = 0
+        self._address: Address | None = None
+        self._address_us = 0
+        self._rest: dict[Address, bytes] = {}
+        self._to_send: list[bytes] = []
+        self._waiting: list[Frame] = []  # lockstep: frames of a period whose barrier is still to come
+        self.sources: dict[tuple[int, int], health.Source] = {}
+        self.latency_us: list[float] = []
+        self.states: list[tuple[float, str, str]] = []
+        self.setpoints = 0
+        self.received = 0
+        self._said_silent = False
+
+    # ---- one frame ----------------------------------------------------------------------------------------------
+    def _refuse(self, frame: Frame, stamp_us: int, reason: str) -> None:
+        if self._refused is None:
+            self._refused = Writer(self._refused_path)
+        self._refused.write(stamp_us, frame.raw)
+        self.refused[reason] = self.refused.get(reason, 0) + 1
+
+    def _accepts(self, frame: Frame, address: Address, stamp_us: int) -> bool:
+        reason = pipeline.accepts(self.plan, self.flight, frame)
+        if not reason and (frame.system, frame.component) == self.flight.life.target and address != self._address:
+            if self._address is not None and stamp_us - self._address_us < _MOVED_S * 1e6:
+                reason = "our autopilot's id from another address"
+            else:
+                self._address = address
+        if reason:
+            self._refuse(frame, stamp_us, reason)
+            return False
+        if address == self._address:
+            self._address_us = stamp_us
+        return True
+
+    def take(self, frame: Frame, address: Address, stamp_us: int) -> None:
+        """Log a frame, act on it, log what it makes us say."""
+        if not self._accepts(frame, address, stamp_us):
+            return
+        key = (frame.system, frame.component)
+        self.sources[key] = health.on_frame(self.sources.get(key), frame.seq)
+        self.received += 1
+        self._act(frame, stamp_us)
+        if self._address is None and key == self.flight.life.target:
+            self._address, self._address_us = address, stamp_us
+
+    def _act(self, frame: Frame, stamp_us: int) -> None:
+        if self.flight.heartbeat_us:
+            self._emit(
+                pipeline.advance(self.plan, self.flight, stamp_us)
+            )  # timers first: they are logged at their own due time
+        self.log.write(stamp_us, frame.raw)
+        self._emit(pipeline.feed(self.plan, self.flight, stamp_us, frame))
+
+    def _emit(self, flight: Flight) -> None:
+        before, self.flight = self.flight, flight
+        for stamp_us, raw in flight.outbox:
+            self.log.write(stamp_us, raw)
+            self._to_send.append(raw)
+            self.setpoints += int.from_bytes(raw[7:10], "little") in _SETPOINTS
+        for row in flight.trace:
+            self.trace.write(row)
+        flight.outbox, flight.trace = [], []
+        if flight.life.state != before.life.state:
+            self.states.append((1e-6 * flight.now_us, flight.life.state, flight.life.reason))
+            print(f"{1e-6 * flight.now_us:9.3f} s  {flight.life.state}: {flight.life.reason}", file=sys.stderr, flush=True)
+
+    def _flush(self) -> None:
+        """Send what has gathered, several frames to a datagram."""
+        parts, self._to_send = self._to_send, []
+        chunk: list[bytes] = []
+        size = 0
+        for raw in parts:
+            if size + len(raw) > _MAX_DATAGRAM:
+                self.endpoint.send(b"".join(chunk))
+                chunk, size = [], 0
+            chunk.append(raw)
+            size += len(raw)
+        if chunk:
+            self.endpoint.send(b"".join(chunk))
+
+    def _want_engage(self, stamp_us: int) -> None:
+        if self._engage and self.flight.life.state == lifecycle.OBSERVING:
+            self._engage = False
+            self._act(request(lifecycle.CMD_ENGAGE, self.plan, 0), stamp_us)
+
+    # ---- the two loops --------------------------------------------------------------------------------------------
+    def stop(self, *_: int | FrameType | None) -> None:
+        """End after what has arrived already."""
+        self._stop = True
+
+    def run(self) -> None:
+        """Until stopped by a signal or `stop()`. The log is whole at every moment."""
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self.stop)
+        try:
+            if self.lockstep:
+                self._run_lockstep()
+            else:
+                self._run_live()
+        finally:
+            self._flush()
+            self.log.close()
+            self.trace.close()
+            if self._refused is not None:
+                self._refused.close()
+            self.endpoint.close()
+
+    def _frames(self, data: bytes, address: Address) -> list[Frame]:
+        """Frames of a datagram, or of a piece of a byte stream."""
+        frames, junk, rest = wire.split(self._rest.pop(address, b"") + data)
+        if rest and not hasattr(self.endpoint, "peers"):
+            self._rest[address] = rest
+        elif rest:
+            junk += len(rest)
+        if junk:
+            self.refused["junk bytes"] = self.refused.get("junk bytes", 0) + junk
+        return frames
+
+    def _run_live(self) -> None:
+        started = last_heard = clock.monotonic_s()
+        greet_us = 0
+        while True:
+            now_us = max(self._stamp_us, clock.wall_us())
+            if not self.flight.heartbeat_us and now_us - greet_us > 1_000_000:  # nobody yet: say that we are here
+                greet_us = now_us
+                own = self.plan.settings.link
+                hello = (18, lifecycle.INVALID, 0, 0, 4, 3)
+                self.endpoint.send(wire.encode("HEARTBEAT", hello, seq=0, system=own.system, component=own.component))
+            arrived = self.endpoint.receive(0.0 if self._stop else self._wait_s(now_us))
+            begun = clock.monotonic_s()
+            self._stamp_us = max(self._stamp_us, clock.wall_us())
+            for data, address in arrived:
+                before = self.setpoints
+                for frame in self._frames(data, address):
+                    self.take(frame, address, self._stamp_us)
+                self._flush()
+                if self.setpoints > before:
+                    self.latency_us.append(1e6 * (clock.monotonic_s() - begun))
+                last_heard = begun
+            if self.flight.heartbeat_us:
+                self._emit(pipeline.advance(self.plan, self.flight, self._stamp_us))
+                self._want_engage(self._stamp_us)
+                self._flush()
+            if self._stop and not arrived:
+                return
+            self._complain(begun - max(started, last_heard))
+
+    def _wait_s(self, now_us: int) -> float:
+        if not self.flight.heartbeat_us:
+            return 0.2
+        return min(0.2, max(0.0, 1e-6 * (pipeline.next_due_us(self.flight) - now_us)))
+
+    def _complain(self, silent_s: float) -> None:
+        if silent_s > _SILENCE_S and not self._said_silent:
+            self._said_silent = True
+            name = getattr(self.endpoint, "name", "the endpoint")
+            print(
+                f"no MAVLink from {name} for {_SILENCE_S:.0f} s; still trying (is the autopilot running, and does it send there?)",
+                file=sys.stderr,
+                flush=True,
+            )
+        elif silent_s < 1.0:
+            self._said_silent = False
+
+    def _run_lockstep(self) -> None:
+        own = self.plan.settings.link
+        hello = wire.encode("HEARTBEAT", (18, lifecycle.INVALID, 0, 0, 4, 3), seq=0, system=own.system, component=own.component)
+        heard = clock.monotonic_s()
+        greeted = -1.0
+        while True:
+            if not self.flight.heartbeat_us and clock.monotonic_s() - greeted > 0.2:
+                greeted = clock.monotonic_s()
+                self.endpoint.send(hello)
+            arrived = self.endpoint.receive(0.0 if self._stop else 0.2)
+            begun = clock.monotonic_s()
+            if not arrived:
+                if self._stop:
+                    return
+                if begun - heard > _LOCKSTEP_WAIT_S and self.flight.heartbeat_us:
+                    raise FlightError(
+                        f"lockstep: no barrier from the autopilot for {_LOCKSTEP_WAIT_S:.0f} s; the flight is over"
+                    )
+                self._complain(begun - heard)
+                continue
+            heard = begun
+            for data, address in arrived:
+                for frame in self._frames(data, address):
+                    self._waiting.append(frame)
+                    if frame.msgid == _TIMESYNC and self._is_barrier(frame):
+                        self._period(address, begun)
+
+    def _is_barrier(self, frame: Frame) -> bool:
+        message = wire.decode(frame)
+        if message.tc1 != 0:
+            return False
+        self._stamp_us = clock.EPOCH_US + message.ts1 // 1000
+        return True
+
+    def _period(self, address: Address, begun: float) -> None:
+        before = self.setpoints
+        frames, self._waiting = self._waiting, []
+        for frame in frames[:-1]:
+            self.take(frame, address, self._stamp_us)
+        self._want_engage(self._stamp_us)
+        self.take(frames[-1], address, self._stamp_us)  # its answer ends the period
+        self._flush()
+        if self.setpoints > before:
+            self.latency_us.append(1e6 * (clock.monotonic_s() - begun))
+
+    # ---- at the end --------------------------------------------------------------------------------------------------
+    def summary(self) -> dict[str, Any]:
+        """What happened, for `fly` and for people."""
+        life = self.flight.life
+        latency = sorted(self.latency_us) or [math.nan]
+        target = self.sources.get(life.target)
+        return {
+            "state": life.state,
+            "reason": life.reason,
+            "states": [{"t_s": round(t, 3), "state": s, "reason": r} for t, s, r in self.states],
+            "setpoints_sent": self.setpoints,
+            "messages_received": self.received,
+            "messages_lost": target.lost if target else 0,
+            "refused": self.refused,
+            "counts": self.flight.counts,
+            "interventions": self.flight.interventions,
+            "hover_thrust": self.flight.hover_thrust,
+            "delay_s": self.flight.delay_s,
+            "rates_hz": {r.name: r.granted_hz for r in life.rates},
+            "latency_us": {
+                "p50": latency[len(latency) // 2],
+                "p99": latency[min(len(latency) - 1, int(0.99 * len(latency)))],
+                "max": latency[-1],
+            },
+            "pid": os.getpid(),
+        }

@@ -1,0 +1,727 @@
+"""One event, pure: `feed(plan, flight, arrival_us, frame) -> (flight, outbox)` and `advance(plan, flight, until_us)` for time.
+
+Everything the companion sends is an output of these two: setpoints, commands, answers, heartbeats, published estimates. A
+received frame enters with the very stamp under which it is logged; timers fire at their logical due time, before any arrival
+stamped at or after it. So a replay of the received frames gives every sent frame and every trace value again, bit for bit.
+"""
+
+import copy
+import difflib
+import importlib
+import math
+from collections.abc import Callable
+from dataclasses import fields as dataclass_fields
+from types import ModuleType
+from typing import Any, NamedTuple
+
+from mavquad import airframe as airframes
+from mavquad import lifecycle, paths, publish, wire
+from mavquad.airframe import Airframe
+from mavquad.config import value as toml_value
+from mavquad.errors import ConfigError, LinkError, WireError
+from mavquad.lifecycle import ENGAGED, OBSERVING, RELEASED, STREAMING, Life, Send
+from mavquad.link import signals as decode
+from mavquad.setpoint import attitude, limits
+from mavquad.settings import Companion
+from mavquad.signals import NAN3, ZERO3, Applied, Attitude, Command, Demand, Estimate, Position, Setpoint, Target, Vec3
+from mavquad.wire import Frame
+
+ESTIMATORS = {
+    "direct": "mavquad.estimate.direct",
+    "joint": "mavquad.estimate.joint_flight",
+    "eskf": "mavquad.estimate.extended_state_flight",
+}
+CONTROLLERS = {
+    "pd": ("mavquad.control.pd", "direct"),
+    "pid": ("mavquad.control.pid", "direct"),
+    "autopilot": ("mavquad.control.pid", "direct"),  # flown by the autopilot's own loop; ours only stands by
+    "adrc": ("mavquad.control.adrc_flight", "direct"),
+    "iadrc": ("mavquad.control.iadrc_flight", "joint"),
+    "eskf-mpc": ("mavquad.control.mpc_flight", "eskf"),
+}
+COMPENSATORS = {"asmf": "mavquad.compensate.active_flight"}
+OBSERVERS = {"gsmo": "mavquad.estimate.gsmo"}
+
+G_M_S2 = attitude.G_M_S2
+_TICK_US = 100_000  # life cycle and watchdog
+_HEARTBEAT_US = 1_000_000
+_LATE_US = 2_000_000  # a stamp further back than this is a restarted clock, not a late message
+_MODE_FIELDS = 6  # MAV_TYPE_ONBOARD_CONTROLLER 18 and its constant fields are in _heartbeat
+
+
+class Stage(NamedTuple):
+    """One chosen module with its gains."""
+
+    label: str
+    module: Any
+    gains: Any
+
+
+class Plan(NamedTuple):
+    """What does not change in flight."""
+
+    settings: Companion
+    airframe: Airframe
+    path: paths.Plan
+    limits: limits.Gains
+    estimator: Stage
+    controller: Stage
+    compensator: Stage | None
+    observers: tuple[Stage, ...]
+    control_us: int
+    trace_names: tuple[str, ...]
+
+
+class Flight:
+    """All that changes. `feed` and `advance` copy it, so a state that was handed in is never changed; its parts are immutable."""
+
+    __slots__ = (
+        "anchor",
+        "anchor_p_m",
+        "anchor_yaw_rad",
+        "applied_thrust_m_s2",
+        "arrival_us",
+        "battery_percent",
+        "compensator",
+        "control_gap_us",
+        "control_us",
+        "controller",
+        "counts",
+        "delay_s",
+        "echo",
+        "epoch",
+        "estimate",
+        "estimator",
+        "heartbeat_us",
+        "hover_thrust",
+        "interventions",
+        "late_us",
+        "lateness_us",
+        "life",
+        "now_us",
+        "observers",
+        "offset_m",
+        "origin_m",
+        "outbox",
+        "path_t0_us",
+        "position",
+        "publish_us",
+        "sent",
+        "sent_us",
+        "seq",
+        "stamps",
+        "tick_us",
+        "timesync_us",
+        "trace",
+    )  # fmt: skip
+
+    life: Life
+    estimator: Any
+    controller: Any
+    compensator: Any
+    observers: tuple[Any, ...]
+    seq: int
+    arrival_us: int  # of the last event
+    now_us: int  # vehicle time of the newest sample
+    control_us: int  # vehicle time of the last control step
+    control_gap_us: int  # period of the pacing stream
+    epoch: int  # how often the autopilot's clock has started
+    stamps: dict[str, int]  # newest vehicle stamp of each kind
+    heartbeat_us: int  # next due, arrival time; 0: not started
+    tick_us: int
+    timesync_us: int
+    publish_us: int
+    position: Position | None
+    offset_m: Vec3  # subtracted from every position: the sum of the autopilot's own resets
+    origin_m: Vec3  # where the vehicle was armed
+    estimate: Estimate | None
+    anchor: int  # vehicle time when the anchor was set; 0: none
+    anchor_p_m: Vec3
+    anchor_yaw_rad: float
+    path_t0_us: int
+    sent: Setpoint | None
+    sent_us: int  # vehicle time
+    applied_thrust_m_s2: float
+    echo: Target | None
+    hover_thrust: float
+    delay_s: float  # measured round trip
+    lateness_us: int  # smallest arrival minus stamp seen: what counts as punctual
+    late_us: int  # since when we are late; 0: punctual
+    interventions: int
+    battery_percent: float
+    counts: dict[str, int]
+    outbox: list[tuple[int, bytes]]
+    trace: list[tuple[float, ...]]
+
+    def clone(self) -> "Flight":
+        other = copy.copy(self)
+        other.stamps, other.counts = self.stamps, self.counts
+        other.outbox, other.trace = [], []
+        return other
+
+
+# ---- building ---------------------------------------------------------------------------------------------------------
+def stage(kind: str, spec: str, table: dict[str, str], tune: dict[str, dict[str, Any]], airframe: Airframe) -> Stage:
+    """A module by `name` or `name:key=value,key=value`, with its Params checked. Raises ConfigError."""
+    name, _, rest = spec.partition(":")
+    if name not in table:
+        raise ConfigError(f"no {kind} is called {name!r}; known: {', '.join(table)}")
+    try:
+        module: ModuleType = importlib.import_module(table[name])
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{kind} {name!r} needs {error.name}, which is not installed") from None
+    values = dict(tune.get(name, {}))
+    for part in filter(None, rest.split(",")):
+        key, equals, text = part.partition("=")
+        if not equals:
+            raise ConfigError(f"{kind} {spec!r}: expected {name}:key=value,key=value")
+        values[key.strip()] = toml_value(text)
+    return Stage(spec, module, module.gains(params(name, module, values), airframe))
+
+
+def params(name: str, module: Any, values: dict[str, Any]) -> Any:
+    """The module's Params from plain values. Raises ConfigError that names an unknown key."""
+    known = [f.name for f in dataclass_fields(module.Params)]
+    for key in values:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+            hint = f'; did you mean "{near[0]}"?' if near else f"; known: {', '.join(known)}"
+            raise ConfigError(f'unknown key "{key}" in [tune.{name}]{hint}')
+    fixed = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    try:
+        return module.Params(**fixed)
+    except TypeError as error:
+        raise ConfigError(f"[tune.{name}] = {values}: {error}") from None
+
+
+def build(settings: Companion) -> Plan:
+    """Everything that is decided before the flight. Raises ConfigError."""
+    airframe = airframes.load(settings.airframe, tuple(settings.airframe_set))
+    module, own = CONTROLLERS[settings.controller]
+    estimator = own if settings.estimator == "auto" else settings.estimator
+    tune = settings.tune
+    for name in tune:
+        if name not in (*ESTIMATORS, *CONTROLLERS, *COMPENSATORS, *OBSERVERS):
+            raise ConfigError(
+                f"[tune.{name}]: no stage has this name; known: {', '.join((*ESTIMATORS, *CONTROLLERS, *OBSERVERS))}"
+            )
+    if settings.controller == "autopilot" and settings.compensator != "none":
+        raise ConfigError(
+            "compensator: the autopilot's own position loop takes positions, nothing that can be corrected; use pid"
+        )
+    observers = tuple(stage("observer", spec, OBSERVERS, tune, airframe) for spec in settings.observers)
+    compensator = (
+        stage("compensator", settings.compensator, COMPENSATORS, tune, airframe) if settings.compensator != "none" else None
+    )
+    return Plan(
+        settings,
+        airframe,
+        paths.plan(settings.path),
+        limits.gains(settings.limits),
+        stage("estimator", estimator, ESTIMATORS, tune, airframe),
+        stage("controller", settings.controller, {settings.controller: module}, tune, airframe),
+        compensator,
+        observers,
+        round(1e6 / settings.control_hz),
+        publish.trace_names(tuple(s.label for s in observers), compensator.module if compensator else None),
+    )
+
+
+def start(plan: Plan) -> Flight:
+    """The state before the first event."""
+    f = Flight()
+    f.life = lifecycle.init(plan.settings)
+    f.life = f.life._replace(rates=tuple(r._replace(msgid=_message_id(r.name)) for r in f.life.rates))
+    f.seq, f.arrival_us, f.epoch = 0, 0, 0
+    f.heartbeat_us = f.tick_us = f.timesync_us = f.publish_us = 0
+    f.counts = {}
+    f.hover_thrust, f.delay_s = plan.airframe.hover_thrust, 0.0
+    f.battery_percent = math.nan
+    f.interventions = 0
+    f.outbox, f.trace = [], []
+    _forget(plan, f)
+    return f
+
+
+def _message_id(name: str) -> int:
+    if name not in wire.ID:
+        near = difflib.get_close_matches(name, wire.ID, n=1)
+        raise ConfigError(f"link.rates_hz: no message is called {name!r}" + (f'; did you mean "{near[0]}"?' if near else ""))
+    return wire.ID[name]
+
+
+def _forget(plan: Plan, f: Flight) -> None:
+    """Begin again with the autopilot's clock: nothing that was estimated before it is worth anything."""
+    f.estimator = plan.estimator.module.init(plan.estimator.gains)
+    f.controller = plan.controller.module.init(plan.controller.gains)
+    f.compensator = plan.compensator.module.init(plan.compensator.gains) if plan.compensator else None
+    f.observers = tuple(s.module.init(s.gains) for s in plan.observers)
+    f.now_us = f.control_us = f.sent_us = f.anchor = f.path_t0_us = 0
+    f.control_gap_us = 0
+    f.stamps = {}
+    f.position, f.offset_m, f.origin_m, f.estimate = None, ZERO3, ZERO3, None
+    f.anchor_p_m, f.anchor_yaw_rad = ZERO3, 0.0
+    f.sent, f.echo, f.applied_thrust_m_s2 = None, None, G_M_S2
+    f.lateness_us, f.late_us = 1 << 62, 0
+
+
+# ---- the two entries ----------------------------------------------------------------------------------------------------
+def advance(plan: Plan, flight: Flight, until_us: int) -> Flight:
+    """Fire every timer due at or before `until_us` (arrival time), each at its own due time."""
+    if until_us < next_due_us(flight):
+        if until_us > flight.arrival_us or flight.outbox or flight.trace:
+            flight = flight.clone()
+            flight.arrival_us = max(flight.arrival_us, until_us)
+        return flight
+    f = flight.clone()
+    while True:
+        due = next_due_us(f)
+        if due > until_us:
+            break
+        f.arrival_us = max(f.arrival_us, due)
+        _fire(plan, f, f.arrival_us)
+    f.arrival_us = max(f.arrival_us, until_us)
+    return f
+
+
+def feed(plan: Plan, flight: Flight, arrival_us: int, frame: Frame) -> Flight:
+    """Timers up to the arrival, then the frame. What is to be sent is in `.outbox` as (stamp, frame), trace rows in `.trace`."""
+    f = flight.clone()
+    if not f.heartbeat_us:  # the first event starts the clockwork
+        f.heartbeat_us = f.tick_us = f.timesync_us = f.publish_us = arrival_us
+    while True:
+        due = next_due_us(f)
+        if due > arrival_us:
+            break
+        f.arrival_us = max(f.arrival_us, due)
+        _fire(plan, f, f.arrival_us)
+    f.arrival_us = max(f.arrival_us, arrival_us)
+    try:
+        message = wire.decode(frame)
+    except WireError:
+        _count(f, "unknown message")
+        return f
+    name = type(message).__name__
+    handler = _HANDLERS.get(name)
+    if handler is not None:
+        handler(plan, f, frame, message)
+    elif name in decode.DECODERS and (frame.system, frame.component) == f.life.target:
+        _sample(plan, f, name, message)
+    return f
+
+
+def accepts(plan: Plan, flight: Flight, frame: Frame) -> str:
+    """ "" where the companion takes the frame, else why not: it belongs in the log of refused frames."""
+    own = plan.settings.link
+    if (frame.system, frame.component) == (own.system, own.component):
+        return "our own address"
+    target = flight.life.target
+    if target == (0, 0) or (frame.system, frame.component) == target:
+        return ""
+    if frame.msgid in _FOR_ANYBODY:
+        return ""
+    return "not from our autopilot"
+
+
+_FOR_ANYBODY = frozenset(
+    wire.ID[name]
+    for name in (
+        "HEARTBEAT",
+        "COMMAND_LONG",
+        "COMMAND_INT",
+        "PARAM_REQUEST_READ",
+        "PARAM_REQUEST_LIST",
+        "PARAM_SET",
+        "TIMESYNC",
+        "PING",
+    )
+)
+
+
+# ---- sending ------------------------------------------------------------------------------------------------------------
+def _send(plan: Plan, f: Flight, name: str, fields: tuple[Any, ...]) -> None:
+    own = plan.settings.link
+    raw = wire.encode(name, fields, seq=f.seq, system=own.system, component=own.component)
+    f.seq = (f.seq + 1) & 0xFF
+    f.outbox.append((f.arrival_us, raw))
+
+
+def _send_all(plan: Plan, f: Flight, sends: tuple[Send, ...]) -> None:
+    for name, fields in sends:
+        _send(plan, f, name, fields)
+
+
+def _count(f: Flight, what: str) -> None:
+    counts = dict(f.counts)
+    counts[what] = counts.get(what, 0) + 1
+    f.counts = counts
+
+
+# ---- time ---------------------------------------------------------------------------------------------------------------
+def next_due_us(f: Flight) -> int:
+    """Arrival time at which the next timer fires; far away before the first event."""
+    if not f.heartbeat_us:
+        return 1 << 62
+    due = min(f.heartbeat_us, f.tick_us, f.timesync_us, f.publish_us)
+    life_due = lifecycle.due_us(f.life)
+    return min(due, max(life_due, f.arrival_us)) if life_due else due
+
+
+def _fire(plan: Plan, f: Flight, now_us: int) -> None:
+    if now_us >= f.heartbeat_us:
+        f.heartbeat_us = now_us + _HEARTBEAT_US
+        _send(plan, f, "HEARTBEAT", (18, lifecycle.INVALID, 0, 0, 4, 3))
+    if now_us >= f.timesync_us:
+        f.timesync_us = now_us + round(1e6 / plan.settings.link.timesync_hz)
+        if f.life.target != (0, 0):
+            _send(plan, f, "TIMESYNC", (0, publish.nanoseconds(now_us), *f.life.target))
+    if now_us >= f.publish_us:
+        f.publish_us = now_us + round(1e6 / plan.settings.link.publish_hz)
+        _send_all(plan, f, publish.estimates(plan, f))
+    due = lifecycle.due_us(f.life)
+    if due and now_us >= due:
+        f.life, sends = lifecycle.on_time(f.life, now_us)
+        _send_all(plan, f, sends)
+    if now_us >= f.tick_us:
+        f.tick_us = now_us + _TICK_US
+        _tick(plan, f, now_us)
+
+
+def vehicle_now_us(f: Flight) -> int:
+    """Vehicle time at the last event, carried on from the newest sample by the arrival clock."""
+    if not f.now_us:
+        return 0
+    return f.now_us + max(0, f.arrival_us - f.stamps.get("arrival of newest", f.arrival_us))
+
+
+def _age_s(f: Flight, *names: str) -> float:
+    newest = max((f.stamps.get(f"{name} arrived", -1) for name in names), default=-1)
+    return math.inf if newest < 0 else 1e-6 * (f.arrival_us - newest)
+
+
+def _tick(plan: Plan, f: Flight, now_us: int) -> None:
+    safety = plan.settings.safety
+    attitude_age, position_age = _age_s(f, "ATTITUDE_QUATERNION", "ATTITUDE"), _age_s(f, "LOCAL_POSITION_NED")
+    p, v = (f.position.p_ned_m, f.position.v_ned_m_s) if f.position else (ZERO3, ZERO3)
+    sight = lifecycle.Sight(attitude_age, position_age, f.origin_m[2] - p[2], math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2))
+    before = f.life
+    f.life, sends = lifecycle.on_tick(f.life, sight, now_us, plan.settings)
+    _send_all(plan, f, sends)
+    if f.life.state == STREAMING and before.state != STREAMING:
+        _anchor(plan, f)
+    if f.life.state == ENGAGED and before.state != ENGAGED:
+        f.path_t0_us = f.now_us + round(1e6 * plan.settings.settle_s)
+    if f.life.state in (STREAMING, ENGAGED):
+        age = max(attitude_age, position_age)
+        if age > safety.release_s:
+            _release(plan, f, f"no telemetry for {age:.1f} s")
+        elif age > safety.hold_s and f.sent is not None:
+            _hold(plan, f, level=age > safety.level_s)
+        elif f.late_us and now_us - f.late_us > 500_000:
+            _release(plan, f, "this companion is too late")
+        _bounds(plan, f, p)
+
+
+def _bounds(plan: Plan, f: Flight, p: Vec3) -> None:
+    safety = plan.settings.safety
+    if f.life.state != ENGAGED or f.life.ended:
+        return
+    why = ""
+    if math.hypot(p[0] - f.origin_m[0], p[1] - f.origin_m[1]) > safety.fence_m:
+        why = f"fence of {safety.fence_m:g} m crossed"
+    elif f.origin_m[2] - p[2] > safety.ceiling_m:
+        why = f"ceiling of {safety.ceiling_m:g} m crossed"
+    elif 0.0 <= f.battery_percent < safety.battery_percent:
+        why = f"battery at {f.battery_percent:.0f} %"
+    if why:
+        _send(plan, f, "STATUSTEXT", lifecycle.text(f"mavquad: {why}, landing", 4)[1])
+        f.life = f.life._replace(ended=True)
+
+
+def _release(plan: Plan, f: Flight, why: str) -> None:
+    f.life, sends = lifecycle.release(f.life, f.arrival_us, why)
+    _send_all(plan, f, sends)
+
+
+def _hold(plan: Plan, f: Flight, level: bool) -> None:
+    """Telemetry is stale: the last setpoint again, or level at hover thrust."""
+    assert f.sent is not None
+    wanted = f.sent._replace(omega_rad_s=ZERO3, type_mask=7)
+    if level:
+        yaw = f.anchor_yaw_rad
+        wanted = Setpoint((math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)), ZERO3, f.hover_thrust, 7)
+    _count(f, "held level" if level else "held")
+    _put(plan, f, wanted, 1e-6 * _TICK_US)
+
+
+# ---- messages -----------------------------------------------------------------------------------------------------------
+def _heartbeat(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
+    known = f.life.target != (0, 0)
+    f.life, sends = lifecycle.on_heartbeat(f.life, (frame.system, frame.component), m, f.arrival_us, plan.settings)
+    _send_all(plan, f, sends)
+    if not f.life.armed and known and f.position is not None and (frame.system, frame.component) == f.life.target:
+        f.origin_m = f.position.p_ned_m
+
+
+def _command_ack(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
+    if (frame.system, frame.component) == f.life.target:
+        f.life, sends = lifecycle.on_ack(f.life, m, f.arrival_us, plan.settings)
+        _send_all(plan, f, sends)
+
+
+def _command_long(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
+    own = plan.settings.link
+    if m.target_component != own.component or m.target_system not in (0, own.system):
+        return
+    f.life, sends, result = lifecycle.on_request(f.life, m.command, f.arrival_us)
+    _send(plan, f, "COMMAND_ACK", (m.command, result, 0, 0, frame.system, frame.component))
+    _send_all(plan, f, sends)
+
+
+def _timesync(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
+    if m.tc1 == 0:
+        _send(plan, f, "TIMESYNC", (publish.nanoseconds(f.arrival_us), m.ts1, frame.system, frame.component))
+    elif (frame.system, frame.component) == f.life.target:
+        round_trip_s = 1e-9 * (publish.nanoseconds(f.arrival_us) - m.ts1)
+        if 0.0 <= round_trip_s < 2.0:
+            f.delay_s += (round_trip_s - f.delay_s) * (0.1 if f.delay_s else 1.0)
+
+
+def _param_value(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
+    if (frame.system, frame.component) != f.life.target:
+        return
+    value = m.param_value
+    if f.life.autopilot != lifecycle.ARDUPILOT and m.param_type <= 6:
+        value = float(decode.int_of_float(value, m.param_type))
+    f.life = lifecycle.on_param(f.life, m.param_id, value, f.arrival_us)
+    if m.param_id in ("MPC_THR_HOVER", "MOT_THST_HOVER") and 0.05 < value < 0.95:
+        f.hover_thrust = value
+
+
+def _home(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
+    if (frame.system, frame.component) == f.life.target:
+        f.life = f.life._replace(home_alt_m=1e-3 * m.altitude)
+
+
+def _extended_state(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
+    if (frame.system, frame.component) == f.life.target:
+        f.life = f.life._replace(landed=m.landed_state)
+
+
+def _sys_status(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
+    if (frame.system, frame.component) == f.life.target:
+        f.battery_percent = float(m.battery_remaining)
+
+
+_HANDLERS: dict[str, Callable[[Plan, Flight, Frame, Any], None]] = {
+    "HEARTBEAT": _heartbeat,
+    "COMMAND_ACK": _command_ack,
+    "COMMAND_LONG": _command_long,
+    "TIMESYNC": _timesync,
+    "PARAM_VALUE": _param_value,
+    "HOME_POSITION": _home,
+    "EXTENDED_SYS_STATE": _extended_state,
+    "SYS_STATUS": _sys_status,
+}
+
+
+# ---- samples --------------------------------------------------------------------------------------------------------------
+def _sample(plan: Plan, f: Flight, name: str, m: Any) -> None:
+    try:
+        sample: Any = decode.DECODERS[name](m)
+    except LinkError:
+        _count(f, f"{name} refused")
+        return
+    if name == "SERVO_OUTPUT_RAW":
+        sample = sample._replace(t_us=decode.unwrap_us(sample.t_us, f.now_us))
+    t_us = sample.t_us
+    if t_us < f.now_us - _LATE_US:
+        _restarted(plan, f)
+    elif t_us <= f.stamps.get(name, -1):
+        _count(f, f"{name} late or twice")
+        return
+    stamps = dict(f.stamps)
+    stamps[name], stamps[f"{name} arrived"] = t_us, f.arrival_us
+    if t_us > f.now_us:
+        f.now_us = t_us
+        stamps["arrival of newest"] = f.arrival_us
+    f.stamps = stamps
+    if isinstance(sample, Position):
+        sample = _continuous(plan, f, sample)
+    elif isinstance(sample, Target):
+        f.echo = sample
+        _learn_hover(f, sample)
+    f.estimator = plan.estimator.module.observe(plan.estimator.gains, f.estimator, sample)
+    if plan.compensator is not None:
+        f.compensator = plan.compensator.module.observe(plan.compensator.gains, f.compensator, sample)
+    if plan.observers:
+        f.observers = tuple(
+            s.module.observe(s.gains, state, sample) for s, state in zip(plan.observers, f.observers, strict=True)
+        )
+    if isinstance(sample, Attitude) and _paces(f, name):
+        _punctual(plan, f, t_us)
+        gap_us = t_us - f.control_us
+        if not f.control_us or gap_us >= plan.control_us - f.control_gap_us // 2:
+            _control(plan, f, t_us, min(0.2, 1e-6 * gap_us) if f.control_us else 1e-6 * plan.control_us)
+
+
+def _paces(f: Flight, name: str) -> bool:
+    """ATTITUDE_QUATERNION paces the control; ATTITUDE only where it is alone."""
+    if name == "ATTITUDE" and f.arrival_us - f.stamps.get("ATTITUDE_QUATERNION arrived", -(1 << 62)) < 500_000:
+        return False
+    gap = f.now_us - f.stamps.get("pace", f.now_us)
+    f.stamps["pace"] = f.now_us
+    if 0 < gap < 200_000:
+        f.control_gap_us = gap if not f.control_gap_us else min(gap, f.control_gap_us)
+    return True
+
+
+def _punctual(plan: Plan, f: Flight, t_us: int) -> None:
+    """Our own lateness: arrival against stamp, beside the best seen (which may creep up, clocks drift)."""
+    offset = f.arrival_us - t_us
+    f.lateness_us = min(offset, f.lateness_us + 20)
+    if offset - f.lateness_us > round(1e6 * plan.settings.safety.late_s):
+        f.late_us = f.late_us or f.arrival_us
+    else:
+        f.late_us = 0
+
+
+def _restarted(plan: Plan, f: Flight) -> None:
+    """The autopilot's clock went back by more than a late message could: it has restarted."""
+    _forget(plan, f)
+    f.epoch += 1
+    _count(f, "autopilot restarts")
+    if f.life.state in (STREAMING, ENGAGED):
+        _release(plan, f, "autopilot restarted")
+    life = lifecycle.init(plan.settings)
+    f.life = life._replace(rates=tuple(r._replace(granted_hz=math.nan) for r in f.life.rates), said="")
+    _send(plan, f, "STATUSTEXT", lifecycle.text("mavquad: autopilot restarted, beginning again", 4)[1])
+
+
+def _continuous(plan: Plan, f: Flight, sample: Position) -> Position:
+    """The position without the autopilot's own resets: a jump that velocity cannot explain moves our frame, not the vehicle."""
+    p = (sample.p_ned_m[0] - f.offset_m[0], sample.p_ned_m[1] - f.offset_m[1], sample.p_ned_m[2] - f.offset_m[2])
+    last = f.position
+    if last is not None:
+        dt_s = 1e-6 * (sample.t_us - last.t_us)
+        jump = [p[i] - last.p_ned_m[i] - 0.5 * dt_s * (sample.v_ned_m_s[i] + last.v_ned_m_s[i]) for i in range(3)]
+        if max(abs(x) for x in jump) > plan.settings.safety.reset_m + 2.0 * dt_s and f.life.state in (STREAMING, ENGAGED):
+            f.offset_m = (f.offset_m[0] + jump[0], f.offset_m[1] + jump[1], f.offset_m[2] + jump[2])
+            p = (p[0] - jump[0], p[1] - jump[1], p[2] - jump[2])
+            _count(f, "position resets")
+            _send(plan, f, "STATUSTEXT", lifecycle.text(f"mavquad: position reset of {math.hypot(*jump):.2f} m", 4)[1])
+    f.position = sample._replace(p_ned_m=p)
+    return f.position
+
+
+def _learn_hover(f: Flight, target: Target) -> None:
+    """In the hover before setpoints flow, the thrust the autopilot holds is what carries this vehicle."""
+    if f.life.steady_us and f.life.state == OBSERVING and 0.05 < target.thrust < 0.95:
+        q = target.q_wxyz
+        upright = 1.0 - 2.0 * (q[1] * q[1] + q[2] * q[2])
+        f.hover_thrust += 0.05 * (target.thrust * upright - f.hover_thrust)
+
+
+# ---- control ----------------------------------------------------------------------------------------------------------------
+def _anchor(plan: Plan, f: Flight) -> None:
+    """Where the path begins, and a first setpoint that changes nothing."""
+    e = f.estimate
+    p = f.position.p_ned_m if f.position else ZERO3
+    q = e.q_wxyz if e else (1.0, 0.0, 0.0, 0.0)
+    yaw = math.atan2(2.0 * (q[0] * q[3] + q[1] * q[2]), 1.0 - 2.0 * (q[2] * q[2] + q[3] * q[3]))
+    f.anchor, f.anchor_p_m, f.anchor_yaw_rad, f.path_t0_us = max(1, f.now_us), p, yaw, 1 << 62
+    thrust = f.echo.thrust if f.echo is not None and f.echo.thrust > 0.05 else f.hover_thrust
+    f.sent = Setpoint(q, ZERO3, thrust, 7)
+    f.controller = plan.controller.module.init(plan.controller.gains)
+
+
+def demand_at(plan: Plan, f: Flight, t_us: int) -> Demand:
+    """Where the path wants the vehicle at a vehicle time."""
+    return paths.demand(plan.path, f.path_t0_us, f.anchor_p_m, f.anchor_yaw_rad, t_us)
+
+
+def _control(plan: Plan, f: Flight, t_us: int, dt_s: float) -> None:
+    """estimate -> control -> compensate -> setpoint, once."""
+    f.control_us = t_us
+    sent = f.sent or Setpoint((1.0, 0.0, 0.0, 0.0), ZERO3, f.hover_thrust, 7)
+    q_sent = sent.q_wxyz
+    applied = Applied(t_us, q_sent, f.applied_thrust_m_s2, sent.omega_rad_s if sent.type_mask != 7 else NAN3, f.delay_s)
+    f.estimator, estimate = plan.estimator.module.step(plan.estimator.gains, f.estimator, applied, t_us)
+    f.estimate = estimate
+    active = f.life.state in (STREAMING, ENGAGED) and f.anchor > 0
+    demand = demand_at(plan, f, t_us) if active else Demand(t_us, NAN3, ZERO3, ZERO3, ZERO3, 0.0, 0.0)
+    nominal = command = Command(NAN3, 0.0, 0.0, NAN3, ZERO3)
+    if active:
+        f.controller, nominal = plan.controller.module.step(
+            plan.controller.gains, f.controller, estimate, demand, lambda t: demand_at(plan, f, t), dt_s
+        )
+        command = nominal
+    if plan.compensator is not None:
+        f.compensator, corrected = plan.compensator.module.step(
+            plan.compensator.gains, f.compensator, estimate, nominal, applied, t_us
+        )
+        if active:
+            command = corrected
+    bits = 0
+    if active and plan.settings.controller == "autopilot":
+        _position_setpoint(plan, f, demand)
+    elif active:
+        bits = _put(plan, f, _setpoint(plan, f, command), dt_s)
+        if t_us >= f.path_t0_us + round(1e6 * plan.path.duration_s) + 1_000_000 and f.life.state == ENGAGED:
+            f.life = f.life._replace(ended=True)
+    if (
+        active
+        and plan.settings.controller == "autopilot"
+        and t_us >= f.path_t0_us + round(1e6 * plan.path.duration_s) + 1_000_000
+    ):
+        f.life = f.life._replace(ended=True)
+    f.trace.append(publish.trace_row(plan, f, t_us, estimate, demand, nominal, command, bits))
+
+
+def _setpoint(plan: Plan, f: Flight, command: Command) -> Setpoint:
+    """Attitude and collective from the wanted acceleration."""
+    gains = plan.limits
+    thrust = attitude.thrust_vector(command.a_ned_m_s2, gains.tilt_rad, 0.2 * G_M_S2, 1.8 * G_M_S2)
+    q, size = attitude.attitude(thrust, command.yaw_rad)
+    # ArduCopter multiplies by 1/cos(tilt) itself: it gets the vertical part only
+    specific = thrust[2] if f.life.autopilot == lifecycle.ARDUPILOT else size
+    omega, mask = command.omega_rad_s, 7
+    if math.isfinite(omega[0]):
+        mask = 128 if plan.settings.loop == "rates" else 0
+        if mask == 0 and f.life.autopilot == lifecycle.ARDUPILOT:
+            omega = _unrotate(q, omega)
+    return Setpoint(q, omega, f.hover_thrust * specific / G_M_S2, mask)
+
+
+def _unrotate(q: tuple[float, float, float, float], w: Vec3) -> Vec3:
+    """ArduCopter rotates the rates given with an attitude by that attitude's heading: turn them back before."""
+    yaw = math.atan2(2.0 * (q[0] * q[3] + q[1] * q[2]), 1.0 - 2.0 * (q[2] * q[2] + q[3] * q[3]))
+    c, s = math.cos(yaw), math.sin(yaw)
+    return (c * w[0] + s * w[1], -s * w[0] + c * w[1], w[2])
+
+
+def _put(plan: Plan, f: Flight, wanted: Setpoint, dt_s: float) -> int:
+    """Through the gate and on the wire."""
+    last = f.sent or wanted
+    setpoint, bits = limits.apply(plan.limits, last, wanted, dt_s)
+    f.interventions += bits != 0
+    f.sent, f.sent_us = setpoint, f.now_us
+    f.applied_thrust_m_s2 = G_M_S2 * setpoint.thrust / f.hover_thrust
+    if f.life.autopilot == lifecycle.ARDUPILOT:
+        q = setpoint.q_wxyz
+        f.applied_thrust_m_s2 /= max(0.3, 1.0 - 2.0 * (q[1] * q[1] + q[2] * q[2]))
+    stamp_ms = (vehicle_now_us(f) // 1000) & 0xFFFFFFFF
+    _send(plan, f, "SET_ATTITUDE_TARGET", decode.attitude_setpoint(stamp_ms, *f.life.target, setpoint))
+    return bits
+
+
+def _position_setpoint(plan: Plan, f: Flight, demand: Demand) -> None:
+    """The autopilot's own loop gets the path: position, velocity, acceleration, heading."""
+    stamp_ms = (vehicle_now_us(f) // 1000) & 0xFFFFFFFF
+    p = [demand.p_ned_m[i] + f.offset_m[i] for i in range(3)]
+    f.sent, f.sent_us = f.sent or Setpoint((1.0, 0.0, 0.0, 0.0), ZERO3, f.hover_thrust, 7), f.now_us
+    fields = (stamp_ms, *f.life.target, 1, 1 << 11, *p, *demand.v_ned_m_s, *demand.a_ned_m_s2, demand.yaw_rad, 0.0)
+    _send(plan, f, "SET_POSITION_TARGET_LOCAL_NED", fields)
+
+
+assert RELEASED in lifecycle.STATES

@@ -1,0 +1,77 @@
+"""companion.toml as frozen typed structures: what one flight of the companion is made of."""
+
+from typing import Any, Literal
+
+import msgspec
+
+from mavquad import config
+from mavquad.errors import ConfigError
+from mavquad.paths import Path
+from mavquad.setpoint.limits import Limits
+
+CONTROLLERS = ("pd", "pid", "adrc", "iadrc", "eskf-mpc", "autopilot")
+
+
+class Link(config.Section):
+    """[link]: who we are, whom we listen to, and the message rates we ask for [Hz] (granted rates may be lower)."""
+
+    system: int = 1
+    component: int = 191
+    target_system: int = 0  # 0: the first autopilot heard
+    rates_hz: dict[str, float] = msgspec.field(
+        default_factory=lambda: {
+            "ATTITUDE_QUATERNION": 250.0,
+            "HIGHRES_IMU": 250.0,
+            "SERVO_OUTPUT_RAW": 250.0,
+            "ATTITUDE": 100.0,
+            "LOCAL_POSITION_NED": 50.0,
+            "ATTITUDE_TARGET": 50.0,
+            "EXTENDED_SYS_STATE": 5.0,
+            "SYS_STATUS": 2.0,
+        }
+    )
+    timesync_hz: float = 5.0
+    publish_hz: float = 5.0
+
+
+class Safety(config.Section):
+    """[safety]: when to hold, level, release or land."""
+
+    hold_s: float = 0.25  # attitude or position older than this: hold the last setpoint
+    level_s: float = 0.75  # ... level, at hover thrust
+    release_s: float = 1.5  # ... stop sending, so that the autopilot's own failsafe acts
+    late_s: float = 0.4  # our own lateness, for half a second: release
+    fence_m: float = 500.0  # horizontal, from where the vehicle was armed
+    ceiling_m: float = 120.0
+    battery_percent: float = 15.0  # land below
+    reset_m: float = 0.6  # a position jump that velocity cannot explain
+
+
+class Companion(config.Section):
+    """A whole companion file."""
+
+    airframe: str = "x500"
+    airframe_set: tuple[str, ...] = ()
+    controller: Literal["pd", "pid", "adrc", "iadrc", "eskf-mpc", "autopilot"] = "pid"
+    estimator: str = "auto"  # the controller's own
+    compensator: Literal["none", "asmf"] = "none"
+    observers: tuple[str, ...] = ("gsmo",)
+    loop: Literal["attitude", "rates"] = "attitude"
+    control_hz: float = 125.0
+    takeoff_m: float = 5.0
+    settle_s: float = 2.0  # engaged at the start point before the path begins
+    seed: int | None = None  # of the scenario; kept in the plan, used by nothing here
+    link: Link = Link()
+    safety: Safety = Safety()
+    limits: Limits = Limits()
+    path: Path = Path()
+    tune: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)  # per stage: tune.pid.wc_rad_s = 2.0
+
+    def __post_init__(self) -> None:
+        if not 1.0 <= self.control_hz <= 1000.0:
+            raise ConfigError(f"control_hz = {self.control_hz}: expected 1 to 1000")
+        if not 0.5 <= self.takeoff_m <= 100.0:
+            raise ConfigError(f"takeoff_m = {self.takeoff_m}: expected 0.5 to 100")
+        for name, hz in self.link.rates_hz.items():
+            if not 0.0 < hz <= 1000.0:
+                raise ConfigError(f"link.rates_hz.{name} = {hz}: expected 0 to 1000 Hz")
