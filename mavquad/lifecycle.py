@@ -117,7 +117,9 @@ def _long(life: Life, number: int, params: tuple[float, ...], confirmation: int)
 
 def due_us(life: Life) -> int:
     """When `on_time` has something to do at the latest; 0: nothing."""
-    times = [t for t in (life.pending.due_us if life.pending else 0, life.wants_due_us if life.wants else 0) if t]
+    times = [
+        t for t in (life.pending.due_us if life.pending else 0, life.wants_due_us if life.phase == "parameters" else 0) if t
+    ]
     return min(times) if times else 0
 
 
@@ -141,7 +143,8 @@ def on_heartbeat(life: Life, source: tuple[int, int], message: Any, now_us: int,
     armed = bool(message.base_mode & ARMED)
     life = life._replace(armed=armed, mode=message.custom_mode, heard_us=now_us, airborne=life.airborne and armed)
     if life.state == ENGAGED and not guided(life):
-        return release(life, now_us, f"mode {message.custom_mode} set by another")
+        landing = life.phase == "landing"
+        return release(life, now_us, "landing by the autopilot" if landing else f"mode {message.custom_mode} set by another")
     if life.state in (STREAMING, ENGAGED) and not armed:
         return release(life, now_us, "disarmed")
     return life, ()

@@ -5,264 +5,26 @@ received frame enters with the very stamp under which it is logged; timers fire 
 stamped at or after it. So a replay of the received frames gives every sent frame and every trace value again, bit for bit.
 """
 
-import copy
-import difflib
-import importlib
 import math
 from collections.abc import Callable
-from dataclasses import fields as dataclass_fields
-from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
-from mavquad import airframe as airframes
 from mavquad import lifecycle, paths, publish, wire
-from mavquad.airframe import Airframe
-from mavquad.config import value as toml_value
-from mavquad.errors import ConfigError, LinkError, WireError
-from mavquad.lifecycle import ENGAGED, OBSERVING, RELEASED, STREAMING, Life, Send
+from mavquad.errors import LinkError, WireError
+from mavquad.flight import Flight, forget, start
+from mavquad.lifecycle import ENGAGED, OBSERVING, STREAMING, Send
 from mavquad.link import signals as decode
+from mavquad.plan import Plan, build
 from mavquad.setpoint import attitude, limits
-from mavquad.settings import Companion
-from mavquad.signals import NAN3, ZERO3, Applied, Attitude, Command, Demand, Estimate, Position, Setpoint, Target, Vec3
+from mavquad.signals import NAN3, ZERO3, Applied, Attitude, Command, Demand, Position, Setpoint, Target, Vec3
 from mavquad.wire import Frame
 
-ESTIMATORS = {
-    "direct": "mavquad.estimate.direct",
-    "joint": "mavquad.estimate.joint_flight",
-    "eskf": "mavquad.estimate.extended_state_flight",
-}
-CONTROLLERS = {
-    "pd": ("mavquad.control.pd", "direct"),
-    "pid": ("mavquad.control.pid", "direct"),
-    "autopilot": ("mavquad.control.pid", "direct"),  # flown by the autopilot's own loop; ours only stands by
-    "adrc": ("mavquad.control.adrc_flight", "direct"),
-    "iadrc": ("mavquad.control.iadrc_flight", "joint"),
-    "eskf-mpc": ("mavquad.control.mpc_flight", "eskf"),
-}
-COMPENSATORS = {"asmf": "mavquad.compensate.active_flight"}
-OBSERVERS = {"gsmo": "mavquad.estimate.gsmo"}
+__all__ = ["Flight", "Plan", "accepts", "advance", "build", "feed", "next_due_us", "start"]
 
 G_M_S2 = attitude.G_M_S2
 _TICK_US = 100_000  # life cycle and watchdog
 _HEARTBEAT_US = 1_000_000
 _LATE_US = 2_000_000  # a stamp further back than this is a restarted clock, not a late message
-_MODE_FIELDS = 6  # MAV_TYPE_ONBOARD_CONTROLLER 18 and its constant fields are in _heartbeat
-
-
-class Stage(NamedTuple):
-    """One chosen module with its gains."""
-
-    label: str
-    module: Any
-    gains: Any
-
-
-class Plan(NamedTuple):
-    """What does not change in flight."""
-
-    settings: Companion
-    airframe: Airframe
-    path: paths.Plan
-    limits: limits.Gains
-    estimator: Stage
-    controller: Stage
-    compensator: Stage | None
-    observers: tuple[Stage, ...]
-    control_us: int
-    trace_names: tuple[str, ...]
-
-
-class Flight:
-    """All that changes. `feed` and `advance` copy it, so a state that was handed in is never changed; its parts are immutable."""
-
-    __slots__ = (
-        "anchor",
-        "anchor_p_m",
-        "anchor_yaw_rad",
-        "applied_thrust_m_s2",
-        "arrival_us",
-        "battery_percent",
-        "compensator",
-        "control_gap_us",
-        "control_us",
-        "controller",
-        "counts",
-        "delay_s",
-        "echo",
-        "epoch",
-        "estimate",
-        "estimator",
-        "heartbeat_us",
-        "hover_thrust",
-        "interventions",
-        "late_us",
-        "lateness_us",
-        "life",
-        "now_us",
-        "observers",
-        "offset_m",
-        "origin_m",
-        "outbox",
-        "path_t0_us",
-        "position",
-        "publish_us",
-        "sent",
-        "sent_us",
-        "seq",
-        "stamps",
-        "tick_us",
-        "timesync_us",
-        "trace",
-    )  # fmt: skip
-
-    life: Life
-    estimator: Any
-    controller: Any
-    compensator: Any
-    observers: tuple[Any, ...]
-    seq: int
-    arrival_us: int  # of the last event
-    now_us: int  # vehicle time of the newest sample
-    control_us: int  # vehicle time of the last control step
-    control_gap_us: int  # period of the pacing stream
-    epoch: int  # how often the autopilot's clock has started
-    stamps: dict[str, int]  # newest vehicle stamp of each kind
-    heartbeat_us: int  # next due, arrival time; 0: not started
-    tick_us: int
-    timesync_us: int
-    publish_us: int
-    position: Position | None
-    offset_m: Vec3  # subtracted from every position: the sum of the autopilot's own resets
-    origin_m: Vec3  # where the vehicle was armed
-    estimate: Estimate | None
-    anchor: int  # vehicle time when the anchor was set; 0: none
-    anchor_p_m: Vec3
-    anchor_yaw_rad: float
-    path_t0_us: int
-    sent: Setpoint | None
-    sent_us: int  # vehicle time
-    applied_thrust_m_s2: float
-    echo: Target | None
-    hover_thrust: float
-    delay_s: float  # measured round trip
-    lateness_us: int  # smallest arrival minus stamp seen: what counts as punctual
-    late_us: int  # since when we are late; 0: punctual
-    interventions: int
-    battery_percent: float
-    counts: dict[str, int]
-    outbox: list[tuple[int, bytes]]
-    trace: list[tuple[float, ...]]
-
-    def clone(self) -> "Flight":
-        other = copy.copy(self)
-        other.stamps, other.counts = self.stamps, self.counts
-        other.outbox, other.trace = [], []
-        return other
-
-
-# ---- building ---------------------------------------------------------------------------------------------------------
-def stage(kind: str, spec: str, table: dict[str, str], tune: dict[str, dict[str, Any]], airframe: Airframe) -> Stage:
-    """A module by `name` or `name:key=value,key=value`, with its Params checked. Raises ConfigError."""
-    name, _, rest = spec.partition(":")
-    if name not in table:
-        raise ConfigError(f"no {kind} is called {name!r}; known: {', '.join(table)}")
-    try:
-        module: ModuleType = importlib.import_module(table[name])
-    except ModuleNotFoundError as error:
-        raise ConfigError(f"{kind} {name!r} needs {error.name}, which is not installed") from None
-    values = dict(tune.get(name, {}))
-    for part in filter(None, rest.split(",")):
-        key, equals, text = part.partition("=")
-        if not equals:
-            raise ConfigError(f"{kind} {spec!r}: expected {name}:key=value,key=value")
-        values[key.strip()] = toml_value(text)
-    return Stage(spec, module, module.gains(params(name, module, values), airframe))
-
-
-def params(name: str, module: Any, values: dict[str, Any]) -> Any:
-    """The module's Params from plain values. Raises ConfigError that names an unknown key."""
-    known = [f.name for f in dataclass_fields(module.Params)]
-    for key in values:
-        if key not in known:
-            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
-            hint = f'; did you mean "{near[0]}"?' if near else f"; known: {', '.join(known)}"
-            raise ConfigError(f'unknown key "{key}" in [tune.{name}]{hint}')
-    fixed = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    try:
-        return module.Params(**fixed)
-    except TypeError as error:
-        raise ConfigError(f"[tune.{name}] = {values}: {error}") from None
-
-
-def build(settings: Companion) -> Plan:
-    """Everything that is decided before the flight. Raises ConfigError."""
-    airframe = airframes.load(settings.airframe, tuple(settings.airframe_set))
-    module, own = CONTROLLERS[settings.controller]
-    estimator = own if settings.estimator == "auto" else settings.estimator
-    tune = settings.tune
-    for name in tune:
-        if name not in (*ESTIMATORS, *CONTROLLERS, *COMPENSATORS, *OBSERVERS):
-            raise ConfigError(
-                f"[tune.{name}]: no stage has this name; known: {', '.join((*ESTIMATORS, *CONTROLLERS, *OBSERVERS))}"
-            )
-    if settings.controller == "autopilot" and settings.compensator != "none":
-        raise ConfigError(
-            "compensator: the autopilot's own position loop takes positions, nothing that can be corrected; use pid"
-        )
-    observers = tuple(stage("observer", spec, OBSERVERS, tune, airframe) for spec in settings.observers)
-    compensator = (
-        stage("compensator", settings.compensator, COMPENSATORS, tune, airframe) if settings.compensator != "none" else None
-    )
-    return Plan(
-        settings,
-        airframe,
-        paths.plan(settings.path),
-        limits.gains(settings.limits),
-        stage("estimator", estimator, ESTIMATORS, tune, airframe),
-        stage("controller", settings.controller, {settings.controller: module}, tune, airframe),
-        compensator,
-        observers,
-        round(1e6 / settings.control_hz),
-        publish.trace_names(tuple(s.label for s in observers), compensator.module if compensator else None),
-    )
-
-
-def start(plan: Plan) -> Flight:
-    """The state before the first event."""
-    f = Flight()
-    f.life = lifecycle.init(plan.settings)
-    f.life = f.life._replace(rates=tuple(r._replace(msgid=_message_id(r.name)) for r in f.life.rates))
-    f.seq, f.arrival_us, f.epoch = 0, 0, 0
-    f.heartbeat_us = f.tick_us = f.timesync_us = f.publish_us = 0
-    f.counts = {}
-    f.hover_thrust, f.delay_s = plan.airframe.hover_thrust, 0.0
-    f.battery_percent = math.nan
-    f.interventions = 0
-    f.outbox, f.trace = [], []
-    _forget(plan, f)
-    return f
-
-
-def _message_id(name: str) -> int:
-    if name not in wire.ID:
-        near = difflib.get_close_matches(name, wire.ID, n=1)
-        raise ConfigError(f"link.rates_hz: no message is called {name!r}" + (f'; did you mean "{near[0]}"?' if near else ""))
-    return wire.ID[name]
-
-
-def _forget(plan: Plan, f: Flight) -> None:
-    """Begin again with the autopilot's clock: nothing that was estimated before it is worth anything."""
-    f.estimator = plan.estimator.module.init(plan.estimator.gains)
-    f.controller = plan.controller.module.init(plan.controller.gains)
-    f.compensator = plan.compensator.module.init(plan.compensator.gains) if plan.compensator else None
-    f.observers = tuple(s.module.init(s.gains) for s in plan.observers)
-    f.now_us = f.control_us = f.sent_us = f.anchor = f.path_t0_us = 0
-    f.control_gap_us = 0
-    f.stamps = {}
-    f.position, f.offset_m, f.origin_m, f.estimate = None, ZERO3, ZERO3, None
-    f.anchor_p_m, f.anchor_yaw_rad = ZERO3, 0.0
-    f.sent, f.echo, f.applied_thrust_m_s2 = None, None, G_M_S2
-    f.lateness_us, f.late_us = 1 << 62, 0
 
 
 # ---- the two entries ----------------------------------------------------------------------------------------------------
@@ -588,7 +350,7 @@ def _punctual(plan: Plan, f: Flight, t_us: int) -> None:
 
 def _restarted(plan: Plan, f: Flight) -> None:
     """The autopilot's clock went back by more than a late message could: it has restarted."""
-    _forget(plan, f)
+    forget(plan, f)
     f.epoch += 1
     _count(f, "autopilot restarts")
     if f.life.state in (STREAMING, ENGAGED):
@@ -722,6 +484,3 @@ def _position_setpoint(plan: Plan, f: Flight, demand: Demand) -> None:
     f.sent, f.sent_us = f.sent or Setpoint((1.0, 0.0, 0.0, 0.0), ZERO3, f.hover_thrust, 7), f.now_us
     fields = (stamp_ms, *f.life.target, 1, 1 << 11, *p, *demand.v_ned_m_s, *demand.a_ned_m_s2, demand.yaw_rad, 0.0)
     _send(plan, f, "SET_POSITION_TARGET_LOCAL_NED", fields)
-
-
-assert RELEASED in lifecycle.STATES

@@ -1,0 +1,139 @@
+"""All that changes in a flight: one state, copied by every event, whose parts are immutable."""
+
+import copy
+import difflib
+import math
+from typing import Any
+
+from mavquad import lifecycle, wire
+from mavquad.errors import ConfigError
+from mavquad.lifecycle import Life
+from mavquad.plan import Plan
+from mavquad.setpoint.attitude import G_M_S2
+from mavquad.signals import ZERO3, Estimate, Position, Setpoint, Target, Vec3
+
+
+class Flight:
+    """All that changes. `feed` and `advance` copy it, so a state that was handed in is never changed; its parts are immutable."""
+
+    __slots__ = (
+        "anchor",
+        "anchor_p_m",
+        "anchor_yaw_rad",
+        "applied_thrust_m_s2",
+        "arrival_us",
+        "battery_percent",
+        "compensator",
+        "control_gap_us",
+        "control_us",
+        "controller",
+        "counts",
+        "delay_s",
+        "echo",
+        "epoch",
+        "estimate",
+        "estimator",
+        "heartbeat_us",
+        "hover_thrust",
+        "interventions",
+        "late_us",
+        "lateness_us",
+        "life",
+        "now_us",
+        "observers",
+        "offset_m",
+        "origin_m",
+        "outbox",
+        "path_t0_us",
+        "position",
+        "publish_us",
+        "sent",
+        "sent_us",
+        "seq",
+        "stamps",
+        "tick_us",
+        "timesync_us",
+        "trace",
+    )  # fmt: skip
+
+    life: Life
+    estimator: Any
+    controller: Any
+    compensator: Any
+    observers: tuple[Any, ...]
+    seq: int
+    arrival_us: int  # of the last event
+    now_us: int  # vehicle time of the newest sample
+    control_us: int  # vehicle time of the last control step
+    control_gap_us: int  # period of the pacing stream
+    epoch: int  # how often the autopilot's clock has started
+    stamps: dict[str, int]  # newest vehicle stamp of each kind
+    heartbeat_us: int  # next due, arrival time; 0: not started
+    tick_us: int
+    timesync_us: int
+    publish_us: int
+    position: Position | None
+    offset_m: Vec3  # subtracted from every position: the sum of the autopilot's own resets
+    origin_m: Vec3  # where the vehicle was armed
+    estimate: Estimate | None
+    anchor: int  # vehicle time when the anchor was set; 0: none
+    anchor_p_m: Vec3
+    anchor_yaw_rad: float
+    path_t0_us: int
+    sent: Setpoint | None
+    sent_us: int  # vehicle time
+    applied_thrust_m_s2: float
+    echo: Target | None
+    hover_thrust: float
+    delay_s: float  # measured round trip
+    lateness_us: int  # smallest arrival minus stamp seen: what counts as punctual
+    late_us: int  # since when we are late; 0: punctual
+    interventions: int
+    battery_percent: float
+    counts: dict[str, int]
+    outbox: list[tuple[int, bytes]]
+    trace: list[tuple[float, ...]]
+
+    def clone(self) -> "Flight":
+        other = copy.copy(self)
+        other.stamps, other.counts = self.stamps, self.counts
+        other.outbox, other.trace = [], []
+        return other
+
+
+def start(plan: Plan) -> Flight:
+    """The state before the first event."""
+    f = Flight()
+    f.life = lifecycle.init(plan.settings)
+    f.life = f.life._replace(rates=tuple(r._replace(msgid=_message_id(r.name)) for r in f.life.rates))
+    f.seq, f.arrival_us, f.epoch = 0, 0, 0
+    f.heartbeat_us = f.tick_us = f.timesync_us = f.publish_us = 0
+    f.counts = {}
+    f.hover_thrust, f.delay_s = plan.airframe.hover_thrust, 0.0
+    f.battery_percent = math.nan
+    f.interventions = 0
+    f.outbox, f.trace = [], []
+    forget(plan, f)
+    return f
+
+
+def _message_id(name: str) -> int:
+    if name not in wire.ID:
+        near = difflib.get_close_matches(name, wire.ID, n=1)
+        raise ConfigError(f"link.rates_hz: no message is called {name!r}" + (f'; did you mean "{near[0]}"?' if near else ""))
+    return wire.ID[name]
+
+
+def forget(plan: Plan, f: Flight) -> None:
+    """Begin again with the autopilot's clock: nothing that was estimated before it is worth anything."""
+    f.estimator = plan.estimator.module.init(plan.estimator.gains)
+    f.controller = plan.controller.module.init(plan.controller.gains)
+    f.compensator = plan.compensator.module.init(plan.compensator.gains) if plan.compensator else None
+    f.observers = tuple(s.module.init(s.gains) for s in plan.observers)
+    f.now_us = f.control_us = f.sent_us = f.anchor = f.path_t0_us = 0
+    f.control_gap_us = 0
+    f.stamps = {}
+    f.position, f.offset_m, f.origin_m, f.estimate = None, ZERO3, ZERO3, None
+    f.anchor_p_m, f.anchor_yaw_rad = ZERO3, 0.0
+    f.sent, f.echo, f.applied_thrust_m_s2 = None, None, G_M_S2
+    f.lateness_us, f.late_us = 1 << 62, 0

@@ -1,0 +1,120 @@
+"""What is decided before a flight: the stages by name, each with its gains."""
+
+import difflib
+import importlib
+from dataclasses import fields as dataclass_fields
+from types import ModuleType
+from typing import Any, NamedTuple
+
+from mavquad import airframe as airframes
+from mavquad import paths, publish
+from mavquad.airframe import Airframe
+from mavquad.config import value as toml_value
+from mavquad.errors import ConfigError
+from mavquad.setpoint import limits
+from mavquad.settings import Companion
+
+ESTIMATORS = {
+    "direct": "mavquad.estimate.direct",
+    "joint": "mavquad.estimate.joint_flight",
+    "eskf": "mavquad.estimate.extended_state_flight",
+}
+CONTROLLERS = {
+    "pd": ("mavquad.control.pd", "direct"),
+    "pid": ("mavquad.control.pid", "direct"),
+    "autopilot": ("mavquad.control.pid", "direct"),  # flown by the autopilot's own loop; ours only stands by
+    "adrc": ("mavquad.control.adrc_flight", "direct"),
+    "iadrc": ("mavquad.control.iadrc_flight", "joint"),
+    "eskf-mpc": ("mavquad.control.mpc_flight", "eskf"),
+}
+COMPENSATORS = {"asmf": "mavquad.compensate.active_flight"}
+OBSERVERS = {"gsmo": "mavquad.estimate.gsmo"}
+
+
+class Stage(NamedTuple):
+    """One chosen module with its gains."""
+
+    label: str
+    module: Any
+    gains: Any
+
+
+class Plan(NamedTuple):
+    """What does not change in flight."""
+
+    settings: Companion
+    airframe: Airframe
+    path: paths.Plan
+    limits: limits.Gains
+    estimator: Stage
+    controller: Stage
+    compensator: Stage | None
+    observers: tuple[Stage, ...]
+    control_us: int
+    trace_names: tuple[str, ...]
+
+
+def stage(kind: str, spec: str, table: dict[str, str], tune: dict[str, dict[str, Any]], airframe: Airframe) -> Stage:
+    """A module by `name` or `name:key=value,key=value`, with its Params checked. Raises ConfigError."""
+    name, _, rest = spec.partition(":")
+    if name not in table:
+        raise ConfigError(f"no {kind} is called {name!r}; known: {', '.join(table)}")
+    try:
+        module: ModuleType = importlib.import_module(table[name])
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"{kind} {name!r} needs {error.name}, which is not installed") from None
+    values = dict(tune.get(name, {}))
+    for part in filter(None, rest.split(",")):
+        key, equals, text = part.partition("=")
+        if not equals:
+            raise ConfigError(f"{kind} {spec!r}: expected {name}:key=value,key=value")
+        values[key.strip()] = toml_value(text)
+    return Stage(spec, module, module.gains(params(name, module, values), airframe))
+
+
+def params(name: str, module: Any, values: dict[str, Any]) -> Any:
+    """The module's Params from plain values. Raises ConfigError that names an unknown key."""
+    known = [f.name for f in dataclass_fields(module.Params)]
+    for key in values:
+        if key not in known:
+            near = difflib.get_close_matches(key, known, n=1, cutoff=0.5)
+            hint = f'; did you mean "{near[0]}"?' if near else f"; known: {', '.join(known)}"
+            raise ConfigError(f'unknown key "{key}" in [tune.{name}]{hint}')
+    fixed = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    try:
+        return module.Params(**fixed)
+    except TypeError as error:
+        raise ConfigError(f"[tune.{name}] = {values}: {error}") from None
+
+
+def build(settings: Companion) -> Plan:
+    """Everything that is decided before the flight. Raises ConfigError."""
+    airframe = airframes.load(settings.airframe, tuple(settings.airframe_set))
+    module, own = CONTROLLERS[settings.controller]
+    estimator = own if settings.estimator == "auto" else settings.estimator
+    tune = settings.tune
+    for name in tune:
+        if name not in (*ESTIMATORS, *CONTROLLERS, *COMPENSATORS, *OBSERVERS):
+            raise ConfigError(
+                f"[tune.{name}]: no stage has this name; known: {', '.join((*ESTIMATORS, *CONTROLLERS, *OBSERVERS))}"
+            )
+    if settings.controller == "autopilot" and settings.compensator != "none":
+        raise ConfigError(
+            "compensator: the autopilot's own position loop takes positions, nothing that can be corrected; use pid"
+        )
+    observers = tuple(stage("observer", spec, OBSERVERS, tune, airframe) for spec in settings.observers)
+    compensator = (
+        stage("compensator", settings.compensator, COMPENSATORS, tune, airframe) if settings.compensator != "none" else None
+    )
+    return Plan(
+        settings,
+        airframe,
+        paths.plan(settings.path),
+        limits.gains(settings.limits),
+        stage("estimator", estimator, ESTIMATORS, tune, airframe),
+        stage("controller", settings.controller, {settings.controller: module}, tune, airframe),
+        compensator,
+        observers,
+        round(1e6 / settings.control_hz),
+        publish.trace_names(tuple(s.label for s in observers), compensator.module if compensator else None),
+    )
