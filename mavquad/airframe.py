@@ -10,14 +10,14 @@ Vec3 = tuple[float, float, float]
 FOLDER = Path(__file__).resolve().parent / "airframes"
 
 
-class Body(config.Section):
+class Body(config.Section, frozen=True):
     """Mass and inertia about the centre of mass, body axes (FRD)."""
 
     mass_kg: float
     inertia_kg_m2: Vec3
 
 
-class Rotors(config.Section):
+class Rotors(config.Section, frozen=True):
     """Four rotors in one plane. Numbering: x: 1 front right, 2 rear left, 3 front left, 4 rear right (1, 2 turn CCW seen from
     above); plus: 1 front, 2 right, 3 rear, 4 left (2, 4 turn CCW)."""
 
@@ -29,14 +29,14 @@ class Rotors(config.Section):
     thrust_min_n: float = 0.0
 
 
-class Drag(config.Section):
+class Drag(config.Section, frozen=True):
     """Force against the air-relative body velocity: -(linear + quadratic |v|) v, per axis."""
 
     linear_n_s_m: Vec3 = (0.0, 0.0, 0.0)
     quadratic_n_s2_m2: Vec3 = (0.0, 0.0, 0.0)
 
 
-class AttitudeResponse(config.Section):
+class AttitudeResponse(config.Section, frozen=True):
     """The autopilot's answer from attitude setpoint to attitude: gain wn^2/(s^2 + 2 zeta wn s + wn^2) after a delay."""
 
     natural_frequency_rad_s: float
@@ -50,7 +50,7 @@ class AttitudeResponse(config.Section):
         return 2.0 * self.damping / self.natural_frequency_rad_s
 
 
-class Airframe(config.Section):
+class Airframe(config.Section, frozen=True):
     """One vehicle. `hover_thrust` is the collective 0..1 that carries it in still air."""
 
     name: str

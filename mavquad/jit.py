@@ -13,7 +13,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 
@@ -52,11 +52,11 @@ def cache_folder() -> Path:
 
 if COMPILED:
     CACHE_FOLDER = cache_folder()
-    numba.config.CACHE_DIR = str(CACHE_FOLDER)
+    numba.config.CACHE_DIR = str(CACHE_FOLDER)  # type: ignore[attr-defined]
 
 
 def kernel(function: _F) -> _F:
     """Compile a scalar function: cached, numpy's error model (x/0 is inf, never an exception), no fastmath."""
     if not COMPILED:
         return function
-    return numba.njit(cache=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+    return cast(_F, numba.njit(cache=True, error_model="numpy")(function))

@@ -17,7 +17,7 @@ NAMES = ("hover", "circle", "spiral", "rectangle", "line", "ellipse")
 _HOVER, _CIRCLE, _SPIRAL, _RECTANGLE, _LINE, _ELLIPSE = range(6)
 
 
-class Path(config.Section):
+class Path(config.Section, frozen=True):
     """[path] of a companion file. Only the keys of the named path are used."""
 
     name: Literal["hover", "circle", "spiral", "rectangle", "line", "ellipse"] = "hover"

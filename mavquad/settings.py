@@ -12,7 +12,7 @@ from mavquad.setpoint.limits import Limits
 CONTROLLERS = ("pd", "pid", "adrc", "iadrc", "eskf-mpc", "autopilot")
 
 
-class Link(config.Section):
+class Link(config.Section, frozen=True):
     """[link]: who we are, whom we listen to, and the message rates we ask for [Hz] (granted rates may be lower)."""
 
     system: int = 1
@@ -34,7 +34,7 @@ class Link(config.Section):
     publish_hz: float = 5.0
 
 
-class Safety(config.Section):
+class Safety(config.Section, frozen=True):
     """[safety]: when to hold, level, release or land."""
 
     hold_s: float = 0.25  # attitude or position older than this: hold the last setpoint
@@ -47,7 +47,7 @@ class Safety(config.Section):
     reset_m: float = 0.6  # a position jump that velocity cannot explain
 
 
-class Companion(config.Section):
+class Companion(config.Section, frozen=True):
     """A whole companion file."""
 
     airframe: str = "x500"

@@ -24,7 +24,7 @@ VEHICLE = {  # short names of what a vehicle can differ in from its file
 }
 
 
-class Flight(config.Section):
+class Flight(config.Section, frozen=True):
     """How far the flight goes and from when it is scored."""
 
     takeoff_m: float
@@ -40,7 +40,7 @@ class Flight(config.Section):
             )
 
 
-class Require(config.Section):
+class Require(config.Section, frozen=True):
     """What the flight must reach to be `ok`, beside landing without a miss."""
 
     rmse_m: float | None = None
@@ -48,7 +48,7 @@ class Require(config.Section):
     misses: int = 0
 
 
-class Scenario(config.Section):
+class Scenario(config.Section, frozen=True):
     """One scenario. The tables of the simulated autopilot and of the companion are checked by their own types."""
 
     about: str
@@ -65,7 +65,7 @@ class Scenario(config.Section):
     companion: dict[str, Any] = field(default_factory=dict)
 
 
-class Options(config.Section):
+class Options(config.Section, frozen=True):
     """What a person chooses beside the scenario. None leaves the companion's own default."""
 
     seed: int = 1

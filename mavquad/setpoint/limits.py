@@ -15,7 +15,7 @@ from mavquad.signals import Quat, Setpoint, Vec3
 NOT_FINITE, TILT, RATE, THRUST, TURN, THRUST_SLEW = 1, 2, 4, 8, 16, 32
 
 
-class Limits(config.Section):
+class Limits(config.Section, frozen=True):
     """[limits] of a companion file."""
 
     tilt_deg: float = 40.0
