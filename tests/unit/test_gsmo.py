@@ -68,10 +68,10 @@ def test_motor_commands_become_the_torque_of_the_mixer():
     rotors, body = X500.rotors, X500.body
     one = 0.1 * (rotors.thrust_max_n - rotors.thrust_min_n)
     yaw = -2.0 * one * rotors.torque_per_thrust_m / body.inertia_kg_m2[2]  # 3 and 4 turn clockwise: the nose goes left
-    np.testing.assert_allclose(state.stream.torque.now, (0.0, 0.0, yaw), atol=1e-12)
+    np.testing.assert_allclose(state.floats[2:5], (0.0, 0.0, yaw), atol=1e-12)
     state = gsmo.observe(gains, gsmo.init(gains), signals.Motors(0, (0.5, 0.6, 0.6, 0.5)))
     roll = 2.0 * one * rotors.arm_m * math.sqrt(0.5) / body.inertia_kg_m2[0]  # 2 and 3 are on the left: it rolls right
-    np.testing.assert_allclose(state.stream.torque.now, (roll, 0.0, 0.0), atol=1e-12)
+    np.testing.assert_allclose(state.floats[2:5], (roll, 0.0, 0.0), atol=1e-12)
 
 
 def test_settings_that_cannot_work_are_refused_with_the_key():
@@ -120,7 +120,7 @@ def test_nothing_that_arrives_makes_the_output_not_finite_and_every_sample_is_co
             q_hat, w, _ = gsmo.read(gains, state, t_us + ahead_us)
             assert all(math.isfinite(x) for x in (*q_hat, *w))
             assert abs(quat.norm(q_hat) - 1.0) < 1e-9
-    counts = state.stream.counts
+    counts = gsmo.health(state, t_us).counts
     refused = counts.not_finite + counts.bad_norm + counts.duplicate + counts.late
     assert counts.accepted + refused == len(record)
     assert counts.bad_torque >= refused_torque
