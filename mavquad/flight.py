@@ -28,6 +28,7 @@ class Flight:
         "control_us",
         "controller",
         "counts",
+        "delay_echo_s",
         "delay_s",
         "echo",
         "epoch",
@@ -50,10 +51,12 @@ class Flight:
         "sent",
         "sent_us",
         "seq",
+        "setpoints",
         "stamps",
         "tick_us",
         "timesync_us",
         "trace",
+        "tuned",
     )  # fmt: skip
 
     life: Life
@@ -91,6 +94,9 @@ class Flight:
     interventions: int
     battery_percent: float
     counts: dict[str, int]
+    tuned: Plan | None  # the plan with the gains as changed in flight
+    delay_echo_s: float  # from a setpoint sent to its echo in ATTITUDE_TARGET; NaN: never recognised
+    setpoints: tuple[tuple[int, float, float], ...]  # the last ones sent: vehicle time, first two vector parts
     outbox: list[tuple[int, bytes]]
     trace: list[tuple[float, ...]]
 
@@ -112,6 +118,7 @@ def start(plan: Plan) -> Flight:
     f.hover_thrust, f.delay_s = plan.airframe.hover_thrust, 0.0
     f.battery_percent = math.nan
     f.interventions = 0
+    f.tuned = None
     f.outbox, f.trace = [], []
     forget(plan, f)
     return f
@@ -135,5 +142,6 @@ def forget(plan: Plan, f: Flight) -> None:
     f.stamps = {}
     f.position, f.offset_m, f.origin_m, f.estimate = None, ZERO3, ZERO3, None
     f.anchor_p_m, f.anchor_yaw_rad = ZERO3, 0.0
+    f.delay_echo_s, f.setpoints = math.nan, ()
     f.sent, f.echo, f.applied_thrust_m_s2 = None, None, G_M_S2
     f.lateness_us, f.late_us = 1 << 62, 0

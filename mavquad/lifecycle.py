@@ -312,6 +312,12 @@ def _before_flight(life: Life, sight: Sight, now_us: int, settings: Companion) -
         return life, ()
     if life.phase.startswith("wait ") and waited_s < 2.0:
         return life, ()
+    if life.autopilot == ARDUPILOT and settings.controller != "autopilot":
+        options = param(life, "GUID_OPTIONS")
+        if math.isnan(options):
+            return release(life, now_us, "GUID_OPTIONS cannot be read")
+        if not int(options) & 8:  # thrust would be a climb rate
+            return release(life, now_us, "set GUID_OPTIONS to 8")
     aloft = life.armed and (life.landed == 2 or sight.height_m > 0.5 * settings.takeoff_m)
     if life.phase in ("climb", "takeover"):
         at_height = life.phase == "takeover" or abs(sight.height_m - settings.takeoff_m) < 0.35

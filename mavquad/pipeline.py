@@ -9,8 +9,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from mavquad import lifecycle, paths, publish, wire
-from mavquad.errors import LinkError, WireError
+from mavquad import lifecycle, paths, publish, tunables, wire
+from mavquad.errors import ConfigError, LinkError, WireError
 from mavquad.flight import Flight, forget, start
 from mavquad.lifecycle import ENGAGED, OBSERVING, STREAMING, Send
 from mavquad.link import signals as decode
@@ -30,6 +30,7 @@ _LATE_US = 2_000_000  # a stamp further back than this is a restarted clock, not
 # ---- the two entries ----------------------------------------------------------------------------------------------------
 def advance(plan: Plan, flight: Flight, until_us: int) -> Flight:
     """Fire every timer due at or before `until_us` (arrival time), each at its own due time."""
+    plan = flight.tuned or plan
     if until_us < next_due_us(flight):
         if until_us > flight.arrival_us or flight.outbox or flight.trace:
             flight = flight.clone()
@@ -48,6 +49,7 @@ def advance(plan: Plan, flight: Flight, until_us: int) -> Flight:
 
 def feed(plan: Plan, flight: Flight, arrival_us: int, frame: Frame) -> Flight:
     """Timers up to the arrival, then the frame. What is to be sent is in `.outbox` as (stamp, frame), trace rows in `.trace`."""
+    plan = flight.tuned or plan
     f = flight.clone()
     if not f.heartbeat_us:  # the first event starts the clockwork
         f.heartbeat_us = f.tick_us = f.timesync_us = f.publish_us = arrival_us
@@ -260,6 +262,49 @@ def _param_value(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
         f.hover_thrust = value
 
 
+def _param_request_list(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
+    if not _for_us(plan, m):
+        return
+    for i in range(len(tunables.tunables(plan))):
+        _send_param(plan, f, i)
+
+
+def _param_request_read(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
+    if not _for_us(plan, m):
+        return
+    names = [t.name for t in tunables.tunables(plan)]
+    if m.param_index >= 0:
+        if m.param_index < len(names):
+            _send_param(plan, f, m.param_index)
+    elif m.param_id in names:
+        _send_param(plan, f, names.index(m.param_id))
+
+
+def _param_set(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
+    if not _for_us(plan, m):
+        return
+    names = [t.name for t in tunables.tunables(plan)]
+    if m.param_id not in names:
+        return
+    try:
+        f.tuned = plan = tunables.change(plan, m.param_id, m.param_value)
+        words = f"mavquad: {m.param_id} = {m.param_value:g}"
+    except ConfigError:
+        words = f"mavquad: {m.param_id} = {m.param_value:g} refused"
+    _send(plan, f, "STATUSTEXT", lifecycle.text(words)[1])
+    _send_param(plan, f, names.index(m.param_id))
+
+
+def _send_param(plan: Plan, f: Flight, index: int) -> None:
+    known = tunables.tunables(plan)
+    _send(plan, f, "PARAM_VALUE", (known[index].name, known[index].value, 9, len(known), index))
+
+
+def _for_us(plan: Plan, m: Any) -> bool:
+    own = plan.settings.link
+    return m.target_system in (0, own.system) and m.target_component in (0, own.component)
+
+
 def _home(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
     if (frame.system, frame.component) == f.life.target:
         f.life = f.life._replace(home_alt_m=1e-3 * m.altitude)
@@ -281,6 +326,9 @@ _HANDLERS: dict[str, Callable[[Plan, Flight, Frame, Any], None]] = {
     "COMMAND_LONG": _command_long,
     "TIMESYNC": _timesync,
     "PARAM_VALUE": _param_value,
+    "PARAM_REQUEST_LIST": _param_request_list,
+    "PARAM_REQUEST_READ": _param_request_read,
+    "PARAM_SET": _param_set,
     "HOME_POSITION": _home,
     "EXTENDED_SYS_STATE": _extended_state,
     "SYS_STATUS": _sys_status,
@@ -313,6 +361,7 @@ def _sample(plan: Plan, f: Flight, name: str, m: Any) -> None:
     elif isinstance(sample, Target):
         f.echo = sample
         _learn_hover(f, sample)
+        _recognise(f, sample)
     f.estimator = plan.estimator.module.observe(plan.estimator.gains, f.estimator, sample)
     if plan.compensator is not None:
         f.compensator = plan.compensator.module.observe(plan.compensator.gains, f.compensator, sample)
@@ -382,6 +431,17 @@ def _learn_hover(f: Flight, target: Target) -> None:
         q = target.q_wxyz
         upright = 1.0 - 2.0 * (q[1] * q[1] + q[2] * q[2])
         f.hover_thrust += 0.05 * (target.thrust * upright - f.hover_thrust)
+
+
+def _recognise(f: Flight, target: Target) -> None:
+    """The echo of a setpoint of ours tells how long it took to get there; an autopilot that shapes its targets never echoes one."""
+    _, x, y, _ = target.q_wxyz
+    for t_us, sent_x, sent_y in f.setpoints:
+        if abs(x - sent_x) < 1e-6 and abs(y - sent_y) < 1e-6 and abs(x) + abs(y) > 1e-4:
+            delay_s = 1e-6 * (target.t_us - t_us)
+            if 0.0 <= delay_s < 1.0:
+                f.delay_echo_s = delay_s if math.isnan(f.delay_echo_s) else f.delay_echo_s + 0.05 * (delay_s - f.delay_echo_s)
+            return
 
 
 # ---- control ----------------------------------------------------------------------------------------------------------------
@@ -473,6 +533,7 @@ def _put(plan: Plan, f: Flight, wanted: Setpoint, dt_s: float) -> int:
         q = setpoint.q_wxyz
         f.applied_thrust_m_s2 /= max(0.3, 1.0 - 2.0 * (q[1] * q[1] + q[2] * q[2]))
     stamp_ms = (vehicle_now_us(f) // 1000) & 0xFFFFFFFF
+    f.setpoints = (*f.setpoints[-24:], (vehicle_now_us(f), setpoint.q_wxyz[1], setpoint.q_wxyz[2]))
     _send(plan, f, "SET_ATTITUDE_TARGET", decode.attitude_setpoint(stamp_ms, *f.life.target, setpoint))
     return bits
 

@@ -36,6 +36,7 @@ class Stage(NamedTuple):
 
     label: str
     module: Any
+    params: Any
     gains: Any
 
 
@@ -69,7 +70,8 @@ def stage(kind: str, spec: str, table: dict[str, str], tune: dict[str, dict[str,
         if not equals:
             raise ConfigError(f"{kind} {spec!r}: expected {name}:key=value,key=value")
         values[key.strip()] = toml_value(text)
-    return Stage(spec, module, module.gains(params(name, module, values), airframe))
+    chosen = params(name, module, values)
+    return Stage(spec, module, chosen, module.gains(chosen, airframe))
 
 
 def params(name: str, module: Any, values: dict[str, Any]) -> Any:

@@ -10,7 +10,7 @@ Source: MAVLink serialisation and signing, https://mavlink.io/en/guide/serializa
 import hashlib
 import struct
 from collections import namedtuple
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from fastcrc.crc16 import mcrf4xx
@@ -48,7 +48,8 @@ class Spec:
         self._extra = bytes([cls.crc_extra])
         self.struct = struct.Struct(cls.unpacker.format)
         self.length = self.struct.size
-        self.make: Callable[..., Any] = namedtuple(cls.msgname, cls.fieldnames)
+        make: Any = namedtuple(cls.msgname, cls.fieldnames)
+        self.make = make
         wire_names = list(cls.ordered_fieldnames)
         self._order = tuple(wire_names.index(name) for name in cls.fieldnames)  # declared position -> wire position
         self._rank = tuple(cls.fieldnames.index(name) for name in wire_names)  # wire position -> declared position

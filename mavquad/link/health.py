@@ -24,7 +24,7 @@ def on_frame(source: Source | None, seq: int) -> Source:
 class Stream(NamedTuple):
     """Arrival of one message."""
 
-    count: int
+    messages: int
     last_us: int
     period_us: float  # smoothed
     jitter_us: float  # smoothed absolute deviation from the period
@@ -35,12 +35,12 @@ def on_message(stream: Stream | None, arrival_us: int) -> Stream:
     if stream is None:
         return Stream(1, arrival_us, 0.0, 0.0)
     gap = float(arrival_us - stream.last_us)
-    if stream.count == 1:
+    if stream.messages == 1:
         return Stream(2, arrival_us, gap, 0.0)
-    k = 1.0 / min(stream.count, 50)
+    k = 1.0 / min(stream.messages, 50)
     period = stream.period_us + k * (gap - stream.period_us)
     jitter = stream.jitter_us + k * (abs(gap - period) - stream.jitter_us)
-    return Stream(stream.count + 1, arrival_us, period, jitter)
+    return Stream(stream.messages + 1, arrival_us, period, jitter)
 
 
 def rate_hz(stream: Stream) -> float:

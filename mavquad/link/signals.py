@@ -114,10 +114,10 @@ def attitude_setpoint(time_boot_ms: int, system: int, component: int, setpoint: 
 def float_of_int(value: int, kind: int) -> float:
     """An integer parameter byte-wise in the float, as PX4 sends it (MAV_PARAM_TYPE 1..6)."""
     code = {1: "<B3x", 2: "<b3x", 3: "<H2x", 4: "<h2x", 5: "<I", 6: "<i"}.get(kind, "<i")
-    return struct.unpack("<f", struct.pack(code, value))[0]  # type: ignore[no-any-return]
+    return struct.unpack("<f", struct.pack(code, value))[0]
 
 
 def int_of_float(value: float, kind: int) -> int:
     """The integer that PX4 put byte-wise into a float parameter (MAV_PARAM_TYPE 1..6)."""
     code = {1: "<B3x", 2: "<b3x", 3: "<H2x", 4: "<h2x", 5: "<I", 6: "<i"}.get(kind, "<i")
-    return struct.unpack(code, struct.pack("<f", value))[0]  # type: ignore[no-any-return]
+    return struct.unpack(code, struct.pack("<f", value))[0]

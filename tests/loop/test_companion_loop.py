@@ -213,3 +213,40 @@ def test_another_vehicle_changes_nothing():
     stranger = wire.encode("ATTITUDE_QUATERNION", fields, seq=0, system=2, component=1)
     (frame,) = wire.split(stranger)[0]
     assert pipeline.accepts(loop.plan, loop.flight, frame) == "not from our autopilot"
+
+
+def _params(loop, *raw):
+    seen = {}
+    for r in raw:
+        loop.take(r)
+    for _, sent in loop.records:
+        for frame, m in wire.parse(sent):
+            if type(m).__name__ == "PARAM_VALUE" and frame.component == 191:
+                seen[m.param_id] = m.param_value
+    return seen
+
+
+def test_gains_are_listed_read_and_changed_in_flight():
+    loop = Loop(Companion(path=Path(name="hover", duration_s=20.0), observers=()))
+    loop.engage()
+    ask = wire.encode("PARAM_REQUEST_LIST", (1, 191), seq=0, system=255, component=190)
+    assert {"PID_WC", "PID_DAMPING", "PID_INTEGRAL"} <= set(_params(loop, ask))
+    change = wire.encode("PARAM_SET", (1, 191, "PID_DAMPING", 1.5, 9), seq=1, system=255, component=190)
+    assert _params(loop, change)["PID_DAMPING"] == 1.5
+    assert loop.flight.tuned.controller.gains.kd == pytest.approx(1.5 * loop.plan.controller.gains.kd)
+    absurd = wire.encode("PARAM_SET", (1, 191, "PID_DAMPING", -4.0, 9), seq=2, system=255, component=190)
+    assert _params(loop, absurd)["PID_DAMPING"] == 1.5
+    assert any("PID_DAMPING = -4 refused" in t for t in loop.texts)
+
+
+def test_an_ardupilot_that_takes_thrust_for_a_climb_rate_is_refused_with_the_parameter_to_set():
+    loop = Loop()
+    loop.until(lifecycle.OBSERVING)
+    life = loop.flight.life._replace(autopilot=lifecycle.ARDUPILOT, params=(("GUID_OPTIONS", 0.0),))
+    loop.flight = loop.flight.clone()
+    loop.flight.life = life
+    loop.take(request(lifecycle.CMD_ENGAGE, loop.plan, 0).raw)
+    loop.run(1.0)
+    assert loop.flight.life.state == lifecycle.RELEASED
+    assert loop.flight.life.reason == "set GUID_OPTIONS to 8"
+    assert not loop.autopilot.armed
