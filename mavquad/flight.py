@@ -1,6 +1,5 @@
 """All that changes in a flight: one state, copied by every event, whose parts are immutable."""
 
-import copy
 import difflib
 import math
 from typing import Any
@@ -15,49 +14,6 @@ from mavquad.signals import ZERO3, Estimate, Position, Setpoint, Target, Vec3
 
 class Flight:
     """All that changes. `feed` and `advance` copy it, so a state that was handed in is never changed; its parts are immutable."""
-
-    __slots__ = (
-        "anchor",
-        "anchor_p_m",
-        "anchor_yaw_rad",
-        "applied_thrust_m_s2",
-        "arrival_us",
-        "battery_percent",
-        "compensator",
-        "control_gap_us",
-        "control_us",
-        "controller",
-        "counts",
-        "delay_echo_s",
-        "delay_s",
-        "echo",
-        "epoch",
-        "estimate",
-        "estimator",
-        "heartbeat_us",
-        "hover_thrust",
-        "interventions",
-        "late_us",
-        "lateness_us",
-        "life",
-        "now_us",
-        "observers",
-        "offset_m",
-        "origin_m",
-        "outbox",
-        "path_t0_us",
-        "position",
-        "publish_us",
-        "sent",
-        "sent_us",
-        "seq",
-        "setpoints",
-        "stamps",
-        "tick_us",
-        "timesync_us",
-        "trace",
-        "tuned",
-    )  # fmt: skip
 
     life: Life
     estimator: Any
@@ -101,8 +57,9 @@ class Flight:
     trace: list[tuple[float, ...]]
 
     def clone(self) -> "Flight":
-        other = copy.copy(self)
-        other.stamps, other.counts = self.stamps, self.counts
+        """A copy to be changed, with nothing to be sent yet."""
+        other = Flight.__new__(Flight)
+        other.__dict__.update(self.__dict__)
         other.outbox, other.trace = [], []
         return other
 

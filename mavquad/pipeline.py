@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mavquad import lifecycle, paths, publish, tunables, wire
-from mavquad.errors import ConfigError, LinkError, WireError
+from mavquad.errors import ConfigError, LinkError
 from mavquad.flight import Flight, forget, start
 from mavquad.lifecycle import ENGAGED, OBSERVING, STREAMING, Send
 from mavquad.link import signals as decode
@@ -60,17 +60,15 @@ def feed(plan: Plan, flight: Flight, arrival_us: int, frame: Frame) -> Flight:
         f.arrival_us = max(f.arrival_us, due)
         _fire(plan, f, f.arrival_us)
     f.arrival_us = max(f.arrival_us, arrival_us)
-    try:
-        message = wire.decode(frame)
-    except WireError:
-        _count(f, "unknown message")
-        return f
-    name = type(message).__name__
-    handler = _HANDLERS.get(name)
+    handler = _HANDLERS.get(frame.msgid)
     if handler is not None:
-        handler(plan, f, frame, message)
-    elif name in decode.DECODERS and (frame.system, frame.component) == f.life.target:
-        _sample(plan, f, name, message)
+        handler(plan, f, frame, wire.decode(frame))
+    elif (frame.system, frame.component) == f.life.target:
+        name = plan.samples.get(frame.msgid)
+        if name is not None:
+            _sample(plan, f, name, wire.decode(frame))
+        elif frame.msgid not in wire.ID_SET:
+            _count(f, "unknown message")
     return f
 
 
@@ -320,7 +318,7 @@ def _sys_status(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
         f.battery_percent = float(m.battery_remaining)
 
 
-_HANDLERS: dict[str, Callable[[Plan, Flight, Frame, Any], None]] = {
+_BY_NAME: dict[str, Callable[[Plan, Flight, Frame, Any], None]] = {
     "HEARTBEAT": _heartbeat,
     "COMMAND_ACK": _command_ack,
     "COMMAND_LONG": _command_long,
@@ -333,6 +331,7 @@ _HANDLERS: dict[str, Callable[[Plan, Flight, Frame, Any], None]] = {
     "EXTENDED_SYS_STATE": _extended_state,
     "SYS_STATUS": _sys_status,
 }
+_HANDLERS = {wire.ID[name]: handler for name, handler in _BY_NAME.items()}
 
 
 # ---- samples --------------------------------------------------------------------------------------------------------------

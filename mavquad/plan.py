@@ -7,7 +7,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from mavquad import airframe as airframes
-from mavquad import paths, publish
+from mavquad import paths, publish, wire
 from mavquad.airframe import Airframe
 from mavquad.config import value as toml_value
 from mavquad.errors import ConfigError
@@ -52,6 +52,7 @@ class Plan(NamedTuple):
     compensator: Stage | None
     observers: tuple[Stage, ...]
     control_us: int
+    samples: dict[int, str]  # messages whose samples some stage uses, by id
     trace_names: tuple[str, ...]
 
 
@@ -108,15 +109,36 @@ def build(settings: Companion) -> Plan:
     compensator = (
         stage("compensator", settings.compensator, COMPENSATORS, tune, airframe) if settings.compensator != "none" else None
     )
+    estimator_stage = stage("estimator", estimator, ESTIMATORS, tune, airframe)
+    controller_stage = stage("controller", settings.controller, {settings.controller: module}, tune, airframe)
     return Plan(
         settings,
         airframe,
         paths.plan(settings.path),
         limits.gains(settings.limits),
-        stage("estimator", estimator, ESTIMATORS, tune, airframe),
-        stage("controller", settings.controller, {settings.controller: module}, tune, airframe),
+        estimator_stage,
+        controller_stage,
         compensator,
         observers,
         round(1e6 / settings.control_hz),
+        _samples((estimator_stage, controller_stage, compensator, *observers)),
         publish.trace_names(tuple(s.label for s in observers), compensator.module if compensator else None),
     )
+
+
+_ALWAYS = ("ATTITUDE_QUATERNION", "ATTITUDE", "LOCAL_POSITION_NED", "ATTITUDE_TARGET")
+_ONLY_WHERE_USED = {"Imu": "HIGHRES_IMU", "Mocap": "ATT_POS_MOCAP", "Motors": "SERVO_OUTPUT_RAW"}
+
+
+def _samples(stages: tuple[Stage | None, ...]) -> dict[int, str]:
+    """Messages to decode. A stage may say which kinds it uses (`uses(gains)`: names of signals); without it: all."""
+    names = list(_ALWAYS)
+    for kind, name in _ONLY_WHERE_USED.items():
+        for chosen in stages:
+            if chosen is None or not hasattr(chosen.module, "observe"):
+                continue
+            uses = getattr(chosen.module, "uses", None)
+            if uses is None or kind in uses(chosen.gains):
+                names.append(name)
+                break
+    return {wire.ID[name]: name for name in names}

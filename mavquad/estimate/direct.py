@@ -49,3 +49,8 @@ def step(gains: Gains, state: State, applied: Applied, t_us: int) -> tuple[State
     age_s = min(gains.carry_s, max(0.0, 1e-6 * (t_us - state.position.t_us)))
     now = (p[0] + age_s * v[0], p[1] + age_s * v[1], p[2] + age_s * v[2])
     return state, Estimate(t_us, now, v, state.q_wxyz, state.omega_rad_s, NAN3, NAN3)
+
+
+def uses(gains: Gains) -> tuple[str, ...]:
+    """The kinds of samples that `observe` keeps."""
+    return ("Attitude", "Position")

@@ -165,6 +165,12 @@ def init(gains: Gains) -> State:
     return State(ints, floats, bank, torque.AT_REST)
 
 
+def uses(gains: Gains) -> tuple[str, ...]:
+    """The kinds of samples that `observe` takes anything from."""
+    kind = "Mocap" if gains.source == "mocap" else "Attitude"
+    return (kind,) if gains.mixer is None else (kind, "Motors")
+
+
 def observe(gains: Gains, state: State, sample: Any) -> State:
     """One arriving sample of any kind; kinds that are not used, and samples that are refused, leave the rates as they are."""
     if isinstance(sample, signals.Mocap if gains.source == "mocap" else signals.Attitude):
