@@ -25,15 +25,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fly until Ctrl-C or SIGTERM; one line of JSON about it on stdout at the end."""
-    from mavquad import config, pipeline, settings
-    from mavquad.companion import Companion
     from mavquad.link import clock
     from mavquad.link.endpoint import open_endpoint
+
+    endpoint = open_endpoint(args.endpoint)  # first: what is wrong with it is known before anything is compiled
+    from mavquad import config, pipeline, settings
+    from mavquad.companion import Companion
 
     chosen = config.load(args.config, settings.Companion) if args.config else settings.Companion()
     plan = pipeline.build(chosen)
     folder = args.run or Path("runs") / f"{clock.stamp()}-companion"
-    companion = Companion(plan, open_endpoint(args.endpoint), folder, lockstep=args.lockstep, engage=args.engage)
+    companion = Companion(plan, endpoint, folder, lockstep=args.lockstep, engage=args.engage)
     try:
         companion.run()
     finally:

@@ -1,0 +1,137 @@
+"""The live companion as a process over real UDP (loopback, free ports), against the scripted autopilot."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from mavquad import wire
+from mavquad.link import tlog
+from tests.oracles.autopilot import Autopilot
+
+CONFIG = 'observers = []\nsettle_s = 0.5\n[path]\nname = "hover"\nduration_s = 1.0\n'
+
+
+def companion(tmp_path, port, *more):
+    config = tmp_path / "companion.toml"
+    config.write_text(CONFIG)
+    words = ["--endpoint", f"udpout:127.0.0.1:{port}", "--config", str(config), "--run", str(tmp_path / "run"), *more]
+    return subprocess.Popen(
+        [sys.executable, "-m", "mavquad", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=Path.cwd()
+    )
+
+
+@pytest.fixture
+def ground():
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.bind(("127.0.0.1", 0))
+    sock.settimeout(20.0)
+    yield sock
+    sock.close()
+
+
+def lockstep(sock, autopilot, until, seconds=60.0):
+    """Serve periods until `until(autopilot)`; each waits for the barrier's answer."""
+    _, address = sock.recvfrom(65535)
+    end = autopilot.t_us + 1e6 * seconds
+    while autopilot.t_us < end and not until(autopilot):
+        sock.sendto(b"".join(autopilot.step()), address)
+        want = autopilot.t_us * 1000
+        answered = False
+        while not answered:
+            for _, m in wire.parse(sock.recvfrom(65535)[0]):
+                answered |= type(m).__name__ == "TIMESYNC" and m.tc1 != 0 and m.ts1 == want
+                if type(m).__name__ != "TIMESYNC":
+                    autopilot.hear(_again(m))
+    return address
+
+
+def _again(message):
+    return wire.encode(type(message).__name__, tuple(message), seq=0, system=1, component=191)
+
+
+def landed(autopilot):
+    return "SET_ATTITUDE_TARGET" in autopilot.heard and not autopilot.armed
+
+
+def test_a_lockstep_flight_over_udp_leaves_a_whole_log_and_a_summary(tmp_path, ground):
+    process = companion(tmp_path, ground.getsockname()[1], "--lockstep", "--engage")
+    autopilot = Autopilot()
+    lockstep(ground, autopilot, landed)
+    assert landed(autopilot)
+    process.send_signal(signal.SIGTERM)
+    out, err = process.communicate(timeout=20)
+    assert process.returncode == 0, err
+    summary = json.loads(out)
+    assert [s["state"] for s in summary["states"]] == ["configuring", "observing", "streaming", "engaged", "released"]
+    assert summary["setpoints_sent"] == sum(name == "SET_ATTITUDE_TARGET" for name in autopilot.heard)
+    with (tmp_path / "run" / "flight.tlog").open("rb") as stream:
+        stamps = [t for t, _ in tlog.read(stream)]
+    assert stamps == sorted(stamps)
+    assert len(stamps) > summary["messages_received"]
+
+
+def test_killed_and_started_again_it_takes_over_into_a_second_log(tmp_path, ground):
+    autopilot = Autopilot()
+    first = companion(tmp_path, ground.getsockname()[1], "--lockstep", "--engage")
+    lockstep(ground, autopilot, lambda a: len(a.setpoints) > 150)
+    first.kill()
+    first.communicate(timeout=20)
+    with (tmp_path / "run" / "flight.tlog").open("rb") as stream:
+        assert sum(1 for _ in tlog.read(stream)) > 500
+    n = len(autopilot.setpoints)
+    second = companion(tmp_path, ground.getsockname()[1], "--lockstep", "--engage")
+    ground.settimeout(0.2)
+    while True:  # what the first one had still sent
+        try:
+            data, _ = ground.recvfrom(65535)
+        except TimeoutError:
+            continue
+        if any(type(m).__name__ == "HEARTBEAT" for _, m in wire.parse(data)):
+            break
+    ground.settimeout(20.0)
+    lockstep(ground, autopilot, landed)
+    second.send_signal(signal.SIGTERM)
+    out, err = second.communicate(timeout=20)
+    assert second.returncode == 0, err
+    assert len(autopilot.setpoints) > n
+    assert "engaged" in [s["state"] for s in json.loads(out)["states"]]
+    assert (tmp_path / "run" / "flight-2.tlog").stat().st_size > 10_000
+
+
+def test_an_endpoint_that_never_answers_is_said_after_five_seconds_and_ctrl_c_leaves_cleanly(tmp_path, ground):
+    process = companion(tmp_path, ground.getsockname()[1])
+    ground.recvfrom(65535)
+    begun = time.monotonic()
+    line = process.stderr.readline()
+    assert 3.0 < time.monotonic() - begun < 9.0
+    assert "no MAVLink from udp 0.0.0.0:" in line
+    assert "still trying" in line
+    process.send_signal(signal.SIGINT)
+    out, _ = process.communicate(timeout=10)
+    assert process.returncode == 0
+    assert json.loads(out)["state"] == "searching"
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "said"),
+    [
+        ("udpin:127.0.0.1:{port}", "in use"),
+        ("udp:127.0.0.1:1", "expected udpin:HOST:PORT"),
+        ("tcp:127.0.0.1:1", "is the other side listening?"),
+        ("serial:/dev/none:57600", "check the device's name"),
+        ("udpin:127.0.0.1:99999", "above 65535"),
+    ],
+)
+def test_an_endpoint_that_cannot_be_opened_is_one_line(tmp_path, ground, endpoint, said):
+    text = endpoint.format(port=ground.getsockname()[1])
+    words = [sys.executable, "-m", "mavquad", "--endpoint", text, "--run", str(tmp_path / "run")]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert said in done.stderr
+    assert done.stderr.count("\n") == 1
