@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     from mavquad.link.endpoint import open_endpoint
 
     endpoint = open_endpoint(args.endpoint)  # first: what is wrong with it is known before anything is compiled
-    from mavquad import config, pipeline, settings
+    from mavquad import config, pipeline, plan_file, settings
     from mavquad.companion import Companion
 
     chosen = config.load(args.config, settings.Companion) if args.config else settings.Companion()
@@ -37,6 +37,7 @@ def run(args: argparse.Namespace) -> int:
     folder = args.run or Path("runs") / f"{clock.stamp()}-companion"
     companion = Companion(plan, endpoint, folder, lockstep=args.lockstep, engage=args.engage)
     try:
+        plan_file.write(plan_file.beside(companion.log.path), plan.settings, plan.airframe)
         companion.run()
     finally:
         print(json.dumps(companion.summary()), flush=True)

@@ -50,6 +50,7 @@ class Flight:
     interventions: int
     battery_percent: float
     counts: dict[str, int]
+    heard_crc: int  # CRC-32 over every frame received: two flights that heard the same have the same
     tuned: Plan | None  # the plan with the gains as changed in flight
     delay_echo_s: float  # from a setpoint sent to its echo in ATTITUDE_TARGET; NaN: never recognised
     setpoints: tuple[tuple[int, float, float], ...]  # the last ones sent: vehicle time, first two vector parts
@@ -74,7 +75,7 @@ def start(plan: Plan) -> Flight:
     f.counts = {}
     f.hover_thrust, f.delay_s = plan.airframe.hover_thrust, 0.0
     f.battery_percent = math.nan
-    f.interventions = 0
+    f.interventions = f.heard_crc = 0
     f.tuned = None
     f.outbox, f.trace = [], []
     forget(plan, f)

@@ -6,6 +6,7 @@ stamped at or after it. So a replay of the received frames gives every sent fram
 """
 
 import math
+import zlib
 from collections.abc import Callable
 from typing import Any
 
@@ -60,6 +61,7 @@ def feed(plan: Plan, flight: Flight, arrival_us: int, frame: Frame) -> Flight:
         f.arrival_us = max(f.arrival_us, due)
         _fire(plan, f, f.arrival_us)
     f.arrival_us = max(f.arrival_us, arrival_us)
+    f.heard_crc = zlib.crc32(frame.raw, f.heard_crc)
     handler = _HANDLERS.get(frame.msgid)
     if handler is not None:
         handler(plan, f, frame, wire.decode(frame))

@@ -90,9 +90,10 @@ def params(name: str, module: Any, values: dict[str, Any]) -> Any:
         raise ConfigError(f"[tune.{name}] = {values}: {error}") from None
 
 
-def build(settings: Companion) -> Plan:
-    """Everything that is decided before the flight. Raises ConfigError."""
-    airframe = airframes.load(settings.airframe, tuple(settings.airframe_set))
+def build(settings: Companion, airframe: Airframe | None = None) -> Plan:
+    """Everything that is decided before the flight; the airframe by its name unless given. Raises ConfigError."""
+    if airframe is None:
+        airframe = airframes.load(settings.airframe, tuple(settings.airframe_set))
     module, own = CONTROLLERS[settings.controller]
     estimator = own if settings.estimator == "auto" else settings.estimator
     tune = settings.tune

@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mavquad import toml
 from mavquad.errors import ConfigError
-from tools import scenarios, toml
+from tools import scenarios
 
 
 @pytest.mark.parametrize("name", scenarios.names())
