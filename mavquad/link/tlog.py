@@ -97,7 +97,7 @@ class Reader:
                 base, data, at = base + at, data[at:] + more, 0
                 if not head:
                     head = data[:_RECORD]
-                    self._refuse_others(head)
+                    refuse_others(self.name, head)
                 continue
             if len(data) - at <= STAMP:
                 break
@@ -113,7 +113,7 @@ class Reader:
             at, synced = (found.start() if found else len(data)) - STAMP, False
         size = base + len(data)
         tail = data[sync_at - base :] if sync_at >= base else b"\xff"
-        self._end(size, size - sync_at, tail)
+        self.junk_bytes += judge_end(self.name, self.messages, size, size - sync_at, tail)
 
     def _frame(self, data: bytes, at: int, synced: bool) -> Frame | None:
         """The frame of a whole record at data[at:], else None. One of an unknown id (no CRC to check) counts only in its place."""
@@ -130,28 +130,33 @@ class Reader:
                 return None
         return frames[0]
 
-    def _refuse_others(self, head: bytes) -> None:
-        """Raises LogError for an empty stream and for the formats that are told by their first bytes."""
-        if not head:
-            raise LogError(f"{self.name}: empty: 0 bytes, expected a tlog (8-byte stamp and MAVLink frame, again and again)")
-        for magic, what in OTHERS:
-            if head.startswith(magic):
-                raise LogError(f"{self.name}: not a tlog but {what}")
-        if _STX.match(head):
-            length = _length(head, 0)
-            if len(head) > length and _STX.match(head, length) and len(wire.split(head[:length])[0]) == 1:
-                raise LogError(f"{self.name}: not a tlog but MAVLink frames without stamps; record it with 8-byte stamps")
 
-    def _end(self, size: int, left: int, tail: bytes) -> None:
-        """What the end of the stream says: nothing, a cut record, junk, or that there was no message at all."""
-        cut = 0 < left < _RECORD and (left <= STAMP or _STX.match(tail, STAMP) is not None)
-        if self.messages == 0 and cut:
-            cut = tail[0] == 0  # no stamp before the year 4253 begins otherwise; a text file does
-        if cut:
-            raise LogError(f"{self.name}: truncated at byte {size}; {self.messages} whole messages read before it")
-        self.junk_bytes += left
-        if self.messages == 0:
-            raise LogError(f"{self.name}: not a tlog: no MAVLink frame behind an 8-byte stamp in its {size} bytes")
+def refuse_others(name: str, head: bytes) -> None:
+    """Raises LogError for an empty file and for the formats that are told by their first bytes."""
+    if not head:
+        raise LogError(f"{name}: empty: 0 bytes, expected a tlog (8-byte stamp and MAVLink frame, again and again)")
+    for magic, what in OTHERS:
+        if head.startswith(magic):
+            raise LogError(f"{name}: not a tlog but {what}")
+    if _STX.match(head):
+        length = _length(head, 0)
+        if len(head) > length and _STX.match(head, length) and len(wire.split(head[:length])[0]) == 1:
+            raise LogError(f"{name}: not a tlog but MAVLink frames without stamps; record it with 8-byte stamps")
+
+
+def judge_end(name: str, messages: int, size: int, left: int, tail: bytes) -> int:
+    """What the bytes after the last whole record are: `left` of `size`, `tail` the first of them. Returns how many are junk.
+
+    Raises LogError where they are a cut record, or where there was no message at all.
+    """
+    cut = 0 < left < _RECORD and (left <= STAMP or _STX.match(tail, STAMP) is not None)
+    if messages == 0 and cut:
+        cut = tail[0] == 0  # no stamp before the year 4253 begins otherwise; a text file does
+    if cut:
+        raise LogError(f"{name}: truncated at byte {size}; {messages} whole messages read before it")
+    if messages == 0:
+        raise LogError(f"{name}: not a tlog: no MAVLink frame behind an 8-byte stamp in its {size} bytes")
+    return left
 
 
 def _length(data: bytes, start: int) -> int:
