@@ -1,0 +1,267 @@
+"""The simulated autopilot as a whole, without a socket or a clock: bytes in, vehicle time on, bytes out.
+
+A shell (`sitl.shell`) opens links, hands over what arrives, moves vehicle time on and sends what `collect` gives. All that happens
+is a function of the configuration and of which bytes came at which vehicle time.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from mavquad import wire
+from mavquad.errors import WireError
+from mavquad.wire import Frame
+from sitl import config, links, px4, telemetry
+from sitl.autopilot import TICK_US, Autopilot, check_airframe
+from sitl.links import NEVER, Link, Stream
+from sitl.params import Table
+from sitl.services import Services
+from sitl.vehicle import Vehicle
+
+COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
+_HEARTBEAT, _TIMESYNC = wire.ID["HEARTBEAT"], wire.ID["TIMESYNC"]
+TRUTH_COMPONENT = 25  # MAV_COMP_ID_USER1: truth has a sequence of its own
+Record = Callable[[int, bytes], None]
+
+
+class Simulation:
+    """One vehicle, its autopilot and its links. `record(t_us, raw)` is given every frame and the truth, stamped in vehicle time.
+
+    With `lockstep` time waits (in the shell) for a companion: its first HEARTBEAT, then an answer to each period's barrier.
+    """
+
+    def __init__(self, sitl: config.Sitl, record: Record | None = None, lockstep: bool = False) -> None:
+        self.config, self.lockstep = sitl, lockstep
+        self.epoch_us = config.EPOCH_US
+        self.vehicle = Vehicle(sitl)
+        check_airframe(self.vehicle)
+        self.links: list[Link] = []
+        self.partner: Link | None = None  # of the lockstep
+        self.periods = self.engaged_periods = self.misses = 0
+        self.sick: set[str] = set()  # sensors with a fault
+        self.gyro_name = "gyro_rad_s"
+        self.mocap_age_us = 1000 * sitl.noise.mocap_delay_ms
+        self._record = record or _nowhere
+        self._period_us = 1000 * sitl.period_ms
+        self._services = Services(self)
+        self.autopilot = self._boot()
+        self._tick_us = TICK_US
+        self._stream_us = NEVER
+        self._was_engaged = False
+        self._barrier_ns = -1
+        self._first_heartbeat: bytes | None = None
+        self._truth_seq = 0
+
+    @property
+    def t_us(self) -> int:
+        """Vehicle time."""
+        return self.vehicle.t_us
+
+    # ---- links --------------------------------------------------------------------------------------------------------
+    def open_link(self) -> Link:
+        """A new peer; its default streams begin at once."""
+        builds = telemetry.builders(self)
+        streams = [Stream(name, rank, builds[name]) for rank, name in enumerate(telemetry.ORDER) if name in self._offered()]
+        link = Link(len(self.links), self.config, streams)
+        self.links.append(link)
+        for name in link.streams:
+            self.set_interval(link, name, 0)
+        return link
+
+    def set_interval(self, link: Link, name: str, wanted_us: int) -> None:
+        """A stream's interval: rounded up to whole loop periods; 0 is the default, below 0 off."""
+        if wanted_us == 0:
+            hz = self._default_hz(name)
+            wanted_us = round(1e6 / hz) if hz else -1
+        dt_us = self.vehicle.dt_us
+        link.set_interval(name, max(dt_us, -(-wanted_us // dt_us) * dt_us) if wanted_us > 0 else 0, self.t_us)
+        self._stream_us = min(s.due_us for peer in self.links for s in peer.ordered) if link.ordered else self._stream_us
+
+    def receive(self, link: Link, data: bytes) -> bool:
+        """Bytes of one datagram. True when the answer to the last barrier was in it; before time 0 nothing is kept."""
+        answered = False
+        frames, refused, rest = wire.split(data)
+        link.refused += refused + len(rest)
+        for frame in frames:
+            if frame.msgid == _TIMESYNC and link is self.partner and self._answers(frame):
+                answered = True
+            elif self.lockstep and self.periods <= 1 and self._is_start(link, frame):
+                continue
+            else:
+                link.up.put(self.t_us, frame.raw)
+            self._log(frame.raw)
+        if answered and self._first_heartbeat is not None:
+            link.up.put(self.t_us, self._first_heartbeat)
+            self._log(self._first_heartbeat)
+            self._first_heartbeat = None
+        return answered
+
+    def collect(self, link: Link) -> list[bytes]:
+        """Datagrams for this peer: what has come through its wire by now, and the barrier for the lockstep's partner."""
+        frames = link.down.take(self.t_us, lambda item: self._frame(link, item))
+        if link is self.partner and self._barrier_ns == 1000 * self.t_us:
+            frames.append(self._frame(link, ("TIMESYNC", (0, self._barrier_ns))))
+        return links.datagrams(frames)
+
+    def send(self, link: Link, name: str, fields: tuple[Any, ...]) -> None:
+        """One message to one peer."""
+        link.down.put(self.t_us, (name, fields))
+
+    def say(self, severity: int, text: str) -> None:
+        """STATUSTEXT to every peer, cut at MAVLink's 50 characters."""
+        for link in self.links:
+            self.send(link, "STATUSTEXT", (severity, text[:50], 0, 0))
+
+    # ---- time ---------------------------------------------------------------------------------------------------------
+    @property
+    def period_end_us(self) -> int:
+        """When the control period that runs now ends."""
+        return (self.t_us // self._period_us + 1) * self._period_us
+
+    def run_period(self) -> None:
+        """One whole control period."""
+        self.run_until(self.period_end_us)
+        self.end_period()
+
+    def end_period(self) -> None:
+        """At the end of a control period: a setpoint missed, the truth written, the barrier made."""
+        self.periods += 1
+        engaged = self.autopilot.engaged
+        if engaged and self._was_engaged:
+            self.engaged_periods += 1
+            self.misses += self.autopilot.fresh == 0
+        self._was_engaged, self.autopilot.fresh = engaged, 0
+        self._write_truth()
+        if self.lockstep:
+            self._barrier_ns = 1000 * self.t_us
+
+    def run_until(self, t_us: int) -> None:
+        """Move on to t_us (a whole number of loop periods): plant, arrivals, modes and streams at their instants."""
+        dt_us = self.vehicle.dt_us
+        while self.t_us < t_us:
+            due_us = min(t_us, self._stream_us, self._tick_us, *(link.up.due_us for link in self.links))
+            steps = -(-(due_us - self.t_us) // dt_us)
+            self.vehicle.run(max(1, steps))
+            now_us = self.t_us
+            for link in self.links:
+                if link.up.due_us <= now_us:
+                    for raw in link.up.take(now_us, _as_it_is):
+                        self._arrived(link, raw)
+            if now_us >= self._tick_us:
+                self._tick_us += TICK_US
+                self._services.tick()
+                self.autopilot.tick(now_us)
+            if now_us >= self._stream_us:
+                self._emit(now_us)
+
+    # ---- sensors as they are sent -------------------------------------------------------------------------------------
+    def sensor(self, name: str) -> list[float]:
+        """A sensor's last value."""
+        return self.vehicle.state.view[name].tolist()  # type: ignore[no-any-return]
+
+    def battery(self) -> float:
+        """What is left of the battery, 1 to 0."""
+        life_s = self.config.battery_s
+        return 1.0 if life_s <= 0.0 else max(0.0, 1.0 - 1e-6 * self.t_us / life_s)
+
+    def reboot_at(self, t_us: int) -> None:
+        """The autopilot starts again then."""
+        raise NotImplementedError
+
+    # ---- inside -------------------------------------------------------------------------------------------------------
+    def _boot(self) -> Autopilot:
+        tuned, _ = config.vehicles(self.config)
+        return px4.Px4(self.vehicle, Table(px4.defaults(tuned), self.config.params, bytewise=True), self.say)
+
+    def _offered(self) -> tuple[str, ...]:
+        return telemetry.ORDER
+
+    def _default_hz(self, name: str) -> float:
+        source = self.config.attitude_source
+        if name == "ATT_POS_MOCAP":
+            return float(self.config.noise.mocap_rate_hz) if source != "ahrs" else 0.0
+        if name in ("ATTITUDE", "ATTITUDE_QUATERNION") and source == "mocap":
+            return 0.0
+        return px4.STREAMS_HZ.get(name, 0.0)
+
+    def _emit(self, t_us: int) -> None:
+        next_us = NEVER
+        for link in self.links:
+            put = link.down.put
+            for stream in link.ordered:
+                if stream.due_us <= t_us:
+                    stream.due_us += stream.interval_us
+                    fields = stream.build()
+                    if fields is not None:
+                        put(t_us, (stream.name, fields))
+                if stream.due_us < next_us:
+                    next_us = stream.due_us
+        self._stream_us = next_us
+
+    def _frame(self, link: Link, item: Any) -> bytes:
+        raw: bytes = item if isinstance(item, bytes) else link.encode(item)
+        self._log(raw)
+        return raw
+
+    def _log(self, raw: bytes) -> None:
+        self._record(self.epoch_us + self.t_us, raw)
+
+    def _answers(self, frame: Frame) -> bool:
+        m = wire.decode(frame)
+        return bool(m.ts1 == self._barrier_ns and m.tc1 != 0)
+
+    def _is_start(self, link: Link, frame: Frame) -> bool:
+        """A companion repeats its first HEARTBEAT until time begins: one of them is kept, however often it came."""
+        if self.partner is None:
+            if frame.msgid == _HEARTBEAT and frame.component == COMPANION:
+                self.partner = link
+            return True
+        if self.periods == 0:
+            return True
+        if link is self.partner and frame.msgid == _HEARTBEAT and frame.component == COMPANION:
+            self._first_heartbeat = frame.raw
+            return True
+        return False
+
+    def _arrived(self, link: Link, raw: bytes) -> None:
+        """One frame at the end of its wire: for us, for others, or both."""
+        frames, refused, rest = wire.split(raw)
+        link.refused += refused + len(rest)
+        for frame in frames:
+            link.received += 1
+            link.speakers.add((frame.system, frame.component))
+            if frame.msgid not in wire.ID_SET:
+                self._forward(link, frame, 0, 0)
+                continue
+            try:
+                m = wire.decode(frame)
+            except WireError:
+                link.refused += 1
+                continue
+            system, component = getattr(m, "target_system", 0), getattr(m, "target_component", 0)
+            ours = system in (0, self.config.system) and component in (0, self.config.component)
+            if len(self.links) > 1 and not (ours and system and component):
+                self._forward(link, frame, system, component)
+            handler = self._services.handlers.get(frame.msgid) if ours else None
+            if handler is not None:
+                handler(link, frame, m)
+
+    def _forward(self, source: Link, frame: Frame, system: int, component: int) -> None:
+        """To the links where the addressee was heard; to all others when it is for everybody."""
+        for link in self.links:
+            heard = any(s == system and component in (0, c) for s, c in link.speakers)
+            if link is not source and (system == 0 or heard):
+                link.down.put(self.t_us, frame.raw)
+
+    def _write_truth(self) -> None:
+        for name, fields in zip(("ODOMETRY", "DEBUG_FLOAT_ARRAY"), telemetry.truth(self), strict=True):
+            raw = wire.encode(name, fields, seq=self._truth_seq, system=self.config.system, component=TRUTH_COMPONENT)
+            self._truth_seq = (self._truth_seq + 1) & 0xFF
+            self._log(raw)
+
+
+def _as_it_is(raw: bytes) -> bytes:
+    return raw
+
+
+def _nowhere(t_us: int, raw: bytes) -> None:
+    """A record that nobody keeps."""

@@ -1,0 +1,230 @@
+"""What the autopilot says about itself: one function per message, giving the fields in MAVLink's declared order.
+
+Sampling instants fall on whole milliseconds, because most stamps are in milliseconds.
+"""
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from sitl.autopilot import ORIGIN, geodetic
+from sitl.plant import GRAVITY_M_S2
+
+if TYPE_CHECKING:
+    from sitl.simulation import Simulation
+
+Fields = tuple[Any, ...]
+NAN = math.nan
+_ZEROS_16 = (0,) * 12
+# gyro, accelerometer, magnetometer, pressure, GPS, rate, attitude, yaw, z, xy control, motors, AHRS, battery, pre-arm check
+_SENSORS = 1 | 2 | 4 | 8 | 32 | 1024 | 2048 | 4096 | 8192 | 16384 | 32768 | 1 << 21 | 1 << 25 | 1 << 28
+_HEALTH = {"gyro": 1, "accel": 2, "imu": 3, "attitude": 1 << 21, "position": 32}
+_MAG_NED_GAUSS = (0.21, 0.013, 0.43)
+_FULL_MV, _EMPTY_MV = 16_800, 13_200
+
+# the order in which messages of one instant leave: the attitude last, since a companion is paced by it
+ORDER = (
+    "HEARTBEAT",
+    "HIGHRES_IMU",
+    "RAW_IMU",
+    "SCALED_IMU",
+    "ATT_POS_MOCAP",
+    "LOCAL_POSITION_NED",
+    "SERVO_OUTPUT_RAW",
+    "ATTITUDE_TARGET",
+    "POSITION_TARGET_LOCAL_NED",
+    "SYS_STATUS",
+    "EXTENDED_SYS_STATE",
+    "GLOBAL_POSITION_INT",
+    "GPS_RAW_INT",
+    "HOME_POSITION",
+    "ESTIMATOR_STATUS",
+    "EKF_STATUS_REPORT",
+    "SYSTEM_TIME",
+    "VFR_HUD",
+    "BATTERY_STATUS",
+    "SIM_STATE",
+    "ATTITUDE",
+    "ATTITUDE_QUATERNION",
+)
+SENSOR_OF = {  # whose dropout silences a message
+    "HIGHRES_IMU": ("imu", "gyro", "accel"),
+    "RAW_IMU": ("imu", "gyro", "accel"),
+    "SCALED_IMU": ("imu", "gyro", "accel"),
+    "ATT_POS_MOCAP": ("mocap",),
+    "LOCAL_POSITION_NED": ("position",),
+    "GLOBAL_POSITION_INT": ("position",),
+    "ATTITUDE": ("attitude",),
+    "ATTITUDE_QUATERNION": ("attitude",),
+}
+
+
+def builders(sim: "Simulation") -> dict[str, Callable[[], Fields | None]]:
+    """Every message that this autopilot can stream: name -> a function that gives its fields, or None for nothing to say."""
+    v, read = sim.vehicle, sim.sensor
+
+    def boot_us() -> int:
+        return v.t_us - sim.autopilot.boot_us
+
+    def boot_ms() -> int:
+        return boot_us() // 1000
+
+    def highres_imu() -> Fields:
+        mag = _body(v.state.view["ahrs_R"].tolist(), _MAG_NED_GAUSS)
+        altitude = ORIGIN[2] - read("nav_p_ned_m")[2]
+        pressure = 1013.25 * (1.0 - altitude / 44330.77) ** 5.255
+        return boot_us(), *read("accel_m_s2"), *read(sim.gyro_name), *mag, pressure, 0.0, altitude, 25.0, 0x1FFF, 0
+
+    def coarse_imu() -> tuple[int, ...]:
+        a = [_int16(1000.0 / GRAVITY_M_S2 * x) for x in read("accel_m_s2")]
+        g = [_int16(1000.0 * x) for x in read(sim.gyro_name)]
+        m = [_int16(1000.0 * x) for x in _body(v.state.view["ahrs_R"].tolist(), _MAG_NED_GAUSS)]
+        return (*a, *g, *m)
+
+    def servo_output_raw() -> Fields:
+        pwm = [int(1000.5 + 1000.0 * u) for u in v.state.view["outputs"].tolist()]
+        return boot_us() & 0xFFFFFFFF, 0, *pwm, *_ZEROS_16
+
+    def local_position_ned() -> Fields | None:
+        if not sim.autopilot.has_origin:
+            return None
+        return boot_ms(), *read("nav_p_ned_m"), *read("nav_v_ned_m_s")
+
+    def global_position_int() -> Fields | None:
+        if not sim.autopilot.has_origin:
+            return None
+        p, u = read("nav_p_ned_m"), read("nav_v_ned_m_s")
+        if not all(map(math.isfinite, (*p, *u))):
+            return None  # integers have no NaN
+        lat, lon, alt = geodetic(p)
+        heading = round(100.0 * math.degrees(sim.autopilot.yaw())) % 36000
+        centi = [_int16(100.0 * x) for x in u]
+        return boot_ms(), lat, lon, round(1000.0 * alt), round(-1000.0 * p[2]), *centi, heading
+
+    def gps_raw_int() -> Fields:
+        p, u = v.state.view["nav_p_ned_m"].tolist(), v.state.view["nav_v_ned_m_s"].tolist()
+        lat, lon, alt = geodetic(p)
+        course = round(100.0 * math.degrees(math.atan2(u[1], u[0]))) % 36000
+        speed = min(65534, round(100.0 * math.hypot(u[0], u[1])))
+        height = round(1000.0 * alt)
+        return boot_us(), 3, lat, lon, height, 80, 120, speed, course, 14, height, 300, 400, 50, 0, 0
+
+    def sys_status() -> Fields:
+        health = _SENSORS & ~sum({_HEALTH[s] for s in sim.sick if s in _HEALTH})
+        left = sim.battery()
+        volts = round(_EMPTY_MV + (_FULL_MV - _EMPTY_MV) * left)
+        return _SENSORS, _SENSORS, health, 250, volts, 1500, round(100 * left), 0, 0, 0, 0, 0, 0, 0, 0, 0
+
+    def battery_status() -> Fields:
+        left = sim.battery()
+        cell = round((_EMPTY_MV + (_FULL_MV - _EMPTY_MV) * left) / 4)
+        cells = (cell,) * 4 + (65535,) * 6
+        return 0, 1, 1, 2500, cells, 1500, -1, -1, round(100 * left), 0, 1, (0,) * 4, 0, 0
+
+    def home_position() -> Fields | None:
+        home = sim.autopilot.home
+        if home is None:
+            return None
+        lat, lon, alt = geodetic(home.p_ned_m)
+        return lat, lon, round(1000.0 * alt), *home.p_ned_m, home.q_wxyz, NAN, NAN, NAN, boot_us()
+
+    def attitude_target() -> Fields:
+        return boot_ms(), *sim.autopilot.attitude_echo()
+
+    def position_target() -> Fields:
+        sp = v.setpoint.view
+        values = [*sp["p_ned_m"].tolist(), *sp["v_ned_m_s"].tolist(), *sp["a_ned_m_s2"].tolist()]
+        mask = sum(1 << i for i, x in enumerate(values) if math.isnan(x)) | 2048
+        return boot_ms(), 1, mask, *values, v.setpoint["yaw_rad"], 0.0
+
+    def sim_state() -> Fields:
+        q = v.state.view["mocap_q_wxyz"].tolist()
+        lat, lon, alt = geodetic(v.state.view["p_ned_m"].tolist())
+        degrees = (1e-7 * lat, 1e-7 * lon, alt)
+        euler, accel, gyro = (v.state.view[name].tolist() for name in ("ahrs_euler_rad", "accel_m_s2", "gyro_rad_s"))
+        return *q, *euler, *accel, *gyro, *degrees, 0.0, 0.0, *v.state.view["v_ned_m_s"].tolist(), lat, lon
+
+    def vfr_hud() -> Fields:
+        p, u = v.state.view["nav_p_ned_m"].tolist(), v.state.view["nav_v_ned_m_s"].tolist()
+        speed = math.hypot(u[0], u[1])
+        heading = round(math.degrees(sim.autopilot.yaw())) % 360
+        return speed, speed, heading, round(100.0 * v.state["thrust"]), ORIGIN[2] - p[2], -u[2]
+
+    return {
+        "HEARTBEAT": lambda: sim.autopilot.heartbeat(),
+        "HIGHRES_IMU": highres_imu,
+        "RAW_IMU": lambda: (boot_us(), *coarse_imu(), 0, 2500),
+        "SCALED_IMU": lambda: (boot_ms(), *coarse_imu(), 2500),
+        "ATT_POS_MOCAP": lambda: (
+            v.t_us - sim.autopilot.boot_us - sim.mocap_age_us,
+            read("mocap_q_wxyz"),
+            *read("mocap_p_ned_m"),
+            (NAN,) + (0.0,) * 20,
+        ),
+        "LOCAL_POSITION_NED": local_position_ned,
+        "SERVO_OUTPUT_RAW": servo_output_raw,
+        "ATTITUDE_TARGET": attitude_target,
+        "POSITION_TARGET_LOCAL_NED": position_target,
+        "SYS_STATUS": sys_status,
+        "EXTENDED_SYS_STATE": lambda: (0, sim.autopilot.landed_state),
+        "GLOBAL_POSITION_INT": global_position_int,
+        "GPS_RAW_INT": gps_raw_int,
+        "HOME_POSITION": home_position,
+        "ESTIMATOR_STATUS": lambda: (boot_us(), 0x33F, 0.1, 0.1, 0.1, 0.1, 0.0, 0.0, 0.2, 0.3),
+        "EKF_STATUS_REPORT": lambda: (0x33F if sim.autopilot.has_origin else 0x407, 0.1, 0.1, 0.1, 0.1, 0.0, 0.0),
+        "SYSTEM_TIME": lambda: (sim.epoch_us + v.t_us, boot_ms()),
+        "VFR_HUD": vfr_hud,
+        "BATTERY_STATUS": battery_status,
+        "SIM_STATE": sim_state,
+        "ATTITUDE": lambda: (boot_ms(), *read("ahrs_euler_rad"), *read("rates_rad_s")),
+        "ATTITUDE_QUATERNION": lambda: (boot_ms(), *read("ahrs_q_wxyz"), *read("rates_rad_s"), (0.0,) * 4),
+    }
+
+
+def truth(sim: "Simulation") -> tuple[Fields, Fields]:
+    """(ODOMETRY, DEBUG_FLOAT_ARRAY `truth`) of this instant; the disturbance is the mean since the last call."""
+    s = sim.vehicle.state
+    t_us, view = sim.vehicle.t_us, s.view
+    R = view["R"].tolist()
+    summed = max(1, s["summed"])
+    force = [x / summed for x in view["disturbance_m_s2"].tolist()]
+    torque = [x / summed for x in view["disturbance_rad_s2"].tolist()]
+    s["disturbance_m_s2"], s["disturbance_rad_s2"], s["summed"] = 0.0, 0.0, 0
+    thrust = sum(view["thrust_n"].tolist()) / sim.vehicle.constants["mass_kg"]
+    velocity = _body(R, view["v_ned_m_s"].tolist())
+    covariance = (NAN,) + (0.0,) * 20
+    odometry = (
+        t_us,
+        1,
+        12,
+        *view["p_ned_m"].tolist(),
+        sim.vehicle.quaternion(),
+        *velocity,
+        *view["omega_rad_s"].tolist(),
+        covariance,
+        covariance,
+        0,
+        0,
+        100,
+    )
+    data = (*force, *torque, *view["wind_ned_m_s"].tolist(), thrust, float(sim.misses), float(sim.autopilot.engaged))
+    return odometry, (t_us, "truth", 1, data + (0.0,) * (58 - len(data)))
+
+
+def autopilot_version(kind: int, capabilities: int, version: int) -> Fields:
+    """AUTOPILOT_VERSION."""
+    empty = (0,) * 8
+    return capabilities, version, 0, 0, 0, empty, empty, empty, 0, 0, 0x6D61767175616400 + kind, (0,) * 18
+
+
+def _body(R: list[float], v: Any) -> tuple[float, float, float]:
+    """R^T v in plain Python."""
+    return (
+        R[0] * v[0] + R[3] * v[1] + R[6] * v[2],
+        R[1] * v[0] + R[4] * v[1] + R[7] * v[2],
+        R[2] * v[0] + R[5] * v[1] + R[8] * v[2],
+    )
+
+
+def _int16(x: float) -> int:
+    return max(-32768, min(32767, round(x))) if math.isfinite(x) else 0

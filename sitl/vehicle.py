@@ -1,0 +1,170 @@
+"""The vehicle with its sensors and inner loops: one compiled call from one sampling instant to the next."""
+
+import math
+
+import numpy as np
+
+from mavquad.airframe import Airframe
+from mavquad.jit import kernel
+from sitl import config, loops, plant, rotation, rotors, sensors, wind
+from sitl.state import CONSTANTS, SETPOINT, VEHICLE, Record
+
+_BLOCK = 4096  # steps drawn at once
+_GENERATORS = (  # one seeded generator per sensor, each with its columns of the block
+    (sensors.GYRO, sensors.ACCEL),
+    (sensors.ACCEL, sensors.DRIFT),
+    (sensors.DRIFT, sensors.POSITION),
+    (sensors.POSITION, sensors.MOCAP),
+    (sensors.MOCAP, sensors.AIR),
+    (sensors.AIR, sensors.COLUMNS),
+)
+_GYRO_CUTOFF_HZ = {"px4": 60.0, "ardupilot": 20.0}
+
+
+@kernel
+def advance(vehicle, setpoint, constants, gusts, normals, steps):
+    """`steps` periods of the loop: loops on what is known, the plant under their outputs, then the sensors again."""
+    s, sp, c = vehicle[0], setpoint[0], constants[0]
+    for _ in range(steps):
+        n = normals[s.step % normals.shape[0]]
+        loops.run(s, sp, c)
+        if s.step % c.air_every == 0:
+            _air(s, c, gusts, n)
+        plant.step(s, c)
+        sensors.sense(s, c, n)
+
+
+@kernel
+def _air(s, c, gusts, n):
+    """The wind at the vehicle, held until the next sample: mean at this height, turbulence along it, gusts."""
+    k = 1.0
+    if c.profile:
+        k = max(0.0, math.log(max(1e-9, -s.p_ned_m[2] / wind.FOOT_M) / 0.15) / math.log(20.0 / 0.15))
+    north, east, down = k * c.mean_wind_m_s[0], k * c.mean_wind_m_s[1], 0.0
+    if c.turbulent:
+        wind.turbulence(c.F, c.B, c.C, s.turbulence, n[sensors.AIR : sensors.AIR + 7], s.gust)
+        north += c.wind_to[0] * s.gust[0] - c.wind_to[1] * s.gust[1]
+        east += c.wind_to[1] * s.gust[0] + c.wind_to[0] * s.gust[1]
+        down = s.gust[2]
+    t = s.step * c.dt_s
+    for i in range(gusts.shape[0]):
+        shape = wind.gust_shape(t, gusts[i, 0], gusts[i, 1])
+        north += shape * gusts[i, 2]
+        east += shape * gusts[i, 3]
+    s.wind_ned_m_s[0], s.wind_ned_m_s[1], s.wind_ned_m_s[2] = north, east, down
+
+
+class Vehicle:
+    """State, setpoint and constants of one vehicle, and the noise it is given. Deterministic in its configuration."""
+
+    def __init__(self, sitl: config.Sitl) -> None:
+        tuned, true = config.vehicles(sitl)
+        self.dt_us = 1_000_000 // sitl.loop_hz
+        self.constants = Record(CONSTANTS)
+        self.setpoint = Record(SETPOINT)
+        self.state = Record(VEHICLE)
+        self._gusts = wind.gust_table(sitl.wind.gusts)
+        self._generators = [np.random.default_rng([sitl.seed, 1 + i]) for i in range(len(_GENERATORS))]
+        self._normals = np.zeros((_BLOCK, sensors.COLUMNS))
+        self._fill_body(sitl, true)
+        self._fill_sensors(sitl)
+        self._fill_air(sitl, true)
+        self._fill_tuning(sitl, tuned)
+        self._stand(sitl)
+
+    @property
+    def t_us(self) -> int:
+        """Vehicle time."""
+        return int(self.state["step"]) * self.dt_us
+
+    def quaternion(self) -> tuple[float, ...]:
+        """True attitude (w, x, y, z)."""
+        return rotation.to_quaternion(tuple(self.state["R"].tolist()))  # type: ignore[no-any-return]
+
+    def run(self, steps: int) -> None:
+        """Move on by a number of loop periods."""
+        while steps > 0:
+            left = _BLOCK - self.state["step"] % _BLOCK
+            now = min(steps, left)
+            advance(self.state.array, self.setpoint.array, self.constants.array, self._gusts, self._normals, now)
+            steps -= now
+            if now == left:
+                self._draw()
+
+    def _draw(self) -> None:
+        for generator, (first, last) in zip(self._generators, _GENERATORS, strict=True):
+            self._normals[:, first:last] = generator.standard_normal((_BLOCK, last - first))
+
+    def _fill_body(self, sitl: config.Sitl, true: Airframe) -> None:
+        c, geometry = self.constants, rotors.geometry(true)
+        assert true.rotors is not None
+        c["dt_s"] = 1e-6 * self.dt_us
+        c["ground_d_m"] = sitl.start.p_ned_m[2]
+        c["mass_kg"], c["inertia_kg_m2"] = true.body.mass_kg, true.body.inertia_kg_m2
+        c["x_m"], c["y_m"], c["spin"], c["torque_per_thrust_m"] = geometry
+        c["thrust_max_n"], c["lag_s"] = true.rotors.thrust_max_n, true.rotors.lag_s
+        c["drag_linear"], c["drag_quadratic"] = true.drag.linear_n_s_m, true.drag.quadratic_n_s2_m2
+        c["effectiveness"] = 1.0
+
+    def _fill_air(self, sitl: config.Sitl, true: Airframe) -> None:
+        c, w = self.constants, sitl.wind
+        assert true.rotors is not None
+        towards = math.radians(w.from_deg + 180.0)
+        c["wind_to"] = math.cos(towards), math.sin(towards)
+        c["mean_wind_m_s"] = w.mean_m_s * math.cos(towards), w.mean_m_s * math.sin(towards)
+        c["profile"], c["turbulent"] = w.profile, w.w20_m_s > 0.0
+        c["air_every"] = round(wind.SAMPLE_S * sitl.loop_hz)
+        c["rotor_model"] = rotors.MODELS[w.rotor_model]
+        c["air_density"], c["rotor_disk_m2"] = w.air_density_kg_m3, w.rotor_disk_m2
+        if w.w20_m_s > 0.0:
+            airspeed = w.turbulence_airspeed_m_s or wind.mean_at(w.w20_m_s, w.turbulence_height_m)
+            d = wind.dryden(w.w20_m_s, w.turbulence_height_m, 2.0 * true.rotors.arm_m, airspeed)
+            c["F"], c["B"], c["C"] = d.F, d.B, d.C
+            self.state["turbulence"] = d.P0 @ np.random.default_rng([sitl.seed, 0]).standard_normal(7)
+
+    def _fill_sensors(self, sitl: config.Sitl) -> None:
+        c, n, dt = self.constants, sitl.noise, 1.0 / sitl.loop_hz
+        c["gyro_sigma"], c["accel_sigma"] = n.gyro_rad_s, n.accel_m_s2
+        c["gyro_bias"], c["accel_bias"], c["velocity_bias"] = n.gyro_bias_rad_s, n.accel_bias_m_s2, n.velocity_bias_m_s
+        keep = math.exp(-dt / sensors.DRIFT_S)
+        c["drift_keep"], c["drift_draw"] = keep, math.radians(n.attitude_deg) * math.sqrt(1.0 - keep * keep)
+        self.state["drift_rad"] = math.radians(n.attitude_deg) * np.random.default_rng([sitl.seed, 99]).standard_normal(3)
+        c["position_sigma"], c["velocity_sigma"] = n.position_m, n.velocity_m_s
+        c["nav_every"] = sitl.loop_hz // 50
+        delay = n.position_delay_ms if n.position_delay_ms is not None else {"px4": 0, "ardupilot": 20}[sitl.personality]
+        c["nav_delay"] = round(1e-3 * delay * sitl.loop_hz)
+        c["mocap_sigma"] = math.radians(n.mocap_deg)
+        c["mocap_every"], c["mocap_delay"] = sitl.loop_hz // n.mocap_rate_hz, round(1e-3 * n.mocap_delay_ms * sitl.loop_hz)
+        wn = 2.0 * math.pi * _GYRO_CUTOFF_HZ[sitl.personality]
+        c["filter_b"], c["filter_a"] = wn * wn * dt, math.sqrt(2.0) * wn * dt
+
+    def _fill_tuning(self, sitl: config.Sitl, tuned: Airframe) -> None:
+        c = self.constants
+        assert tuned.rotors is not None
+        c["personality"] = {"px4": 0, "ardupilot": 1}[sitl.personality]
+        c["tuned_inertia"], c["tuned_thrust_max_n"] = tuned.body.inertia_kg_m2, tuned.rotors.thrust_max_n
+        c["idle"] = tuned.rotors.thrust_min_n / tuned.rotors.thrust_max_n
+        c["allocation"], c["hover_thrust"] = rotors.allocation(tuned), tuned.hover_thrust
+        c["rate_p"], c["rate_i"], c["rate_d"] = (28.0, 28.0, 6.0), (15.0, 15.0, 3.0), (0.3, 0.3, 0.0)
+        c["attitude_p"], c["rate_limit"] = (9.0, 9.0, 2.8), (3.84, 3.84, 3.49)
+        c["position_every"] = sitl.loop_hz // 100
+        c["accel_max"], c["tilt_max_rad"] = 20.0, math.radians(45.0)
+
+    def _stand(self, sitl: config.Sitl) -> None:
+        """On the ground, at rest, sensors settled: the first instant is as good as any later one."""
+        s, start = self.state, sitl.start
+        R = rotation.from_euler(0.0, 0.0, math.radians(start.yaw_deg))
+        s["p_ned_m"], s["R"], s["ahrs_R"], s["target_R"], s["grounded"] = start.p_ned_m, R, R, R, 1
+        s["past"][:, :3], s["past_R"][:] = start.p_ned_m, R
+        s["ahrs_q_wxyz"] = rotation.to_quaternion(R)
+        self.setpoint["yaw_rad"] = math.radians(start.yaw_deg)
+        for name in ("p_ned_m", "v_ned_m_s", "a_ned_m_s2"):
+            self.setpoint[name] = math.nan
+        self._draw()
+        sense_now(s.array, self.constants.array, np.random.default_rng([sitl.seed, 98]).standard_normal(sensors.COLUMNS))
+
+
+@kernel
+def sense_now(vehicle, constants, normals):
+    """Sample the sensors without moving."""
+    sensors.sense(vehicle[0], constants[0], normals)
