@@ -8,7 +8,7 @@ One `predict` per tick with the true time step, then one `update` with the outpu
 
 Deviations from the paper:
   Eq. (25)  B_f is the discretised one, f an acceleration, and f acts on as many states as outputs can tell apart.
-  Eq. (26)  corrected (see ellipsoid.py); default is sequential strips. "joint" and "printed" are for comparison.
+  Eq. (26)  corrected (see ellipsoid.py) and taken one output at a time; all at once, as printed, is in asmf_joint.py.
   Q, R      shape matrices of bounds, not covariances: a box of n sides needs n diag(b^2).
   no text   says what to do when a set is empty: here an output that contradicts the set is dropped twice as an outlier, the
             third time running the set is enlarged until it fits. Many enlargements raise Q_f and take authority away.
@@ -16,7 +16,7 @@ Deviations from the paper:
 
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,13 +24,9 @@ from mavquad.errors import ConfigError
 from mavquad.estimate import ellipsoid
 from mavquad.jit import kernel
 
-STRIPS, JOINT, PRINTED = 0, 1, 2
-_FORMS = {"strips": STRIPS, "joint": JOINT, "printed": PRINTED}
-
 OUTLIERS = 2  # contradictions in a row taken for outliers; the next one enlarges the set
 CLEAN_UPDATES = 50  # that bring the guarantee back
-INFLATED_DELTA = 0.2  # joint form
-INFLATED_MARGIN = 1.2  # strips
+INFLATED_MARGIN = 1.2
 WINDOW_US = 10_000_000
 HALF_ABOVE, OFF_ABOVE = 5, 20  # enlargements within the window
 
@@ -44,8 +40,6 @@ class Params:
     p0: tuple[float, ...]  # (n,) squared half-axes of the first ellipsoid
     model_error: tuple[int, ...]  # which states are f
     scale: tuple[float, ...] | None = None  # (n,) S: what one unit of each state is worth; SI where None
-    form: Literal["strips", "joint", "printed"] = "strips"
-    scaled_outputs: bool = True  # joint: rho on R^-1/2-scaled outputs
 
     def __post_init__(self) -> None:
         n = len(self.b)
@@ -58,22 +52,15 @@ class Params:
             raise ConfigError(f"asmf.p0 and asmf.scale need one value for each of the {n} states of asmf.b")
         if not all(0 <= i < n for i in self.model_error):
             raise ConfigError(f"asmf.model_error = {self.model_error}: expected indices 0 to {n - 1}")
-        if self.form not in _FORMS:
-            raise ConfigError(f"asmf.form = {self.form!r}: expected one of {', '.join(_FORMS)}")
 
 
 class Gains(NamedTuple):
     c: np.ndarray  # (m, n)
     e: np.ndarray  # (m,)
-    r_factor: (
-        float  # R = r_factor x (number of outputs used) x diag(e^2); 1 is right, 1/m is "R = diag(e^2)" and loses the truth
-    )
     q: np.ndarray  # (n,)
     p0: np.ndarray  # (n,)
     inv_s2: np.ndarray  # (n,)
     is_f: np.ndarray  # (n,) bool
-    form: int
-    scaled_outputs: bool
 
 
 class State(NamedTuple):
@@ -100,13 +87,10 @@ def gains(params: Params, c: np.ndarray) -> Gains:
     return Gains(
         np.ascontiguousarray(c, dtype=float),
         np.array(params.e, dtype=float),
-        1.0,
         float(np.count_nonzero(b)) * b**2,
         np.array(params.p0, dtype=float),
         1.0 / scale**2,
         is_f,
-        _FORMS[params.form],
-        params.scaled_outputs,
     )
 
 
@@ -143,10 +127,13 @@ def authority(state: State, t_us: int) -> float:
 
 
 @kernel
-def predict(gains: Gains, state: State, f: np.ndarray, drive: np.ndarray, t_us: int) -> State:
-    """One tick: z = F z + drive + w, |w_i| <= b_i. f (n, n), drive (n,): inputs as applied (saturated) and other known terms."""
+def predict(gains: Gains, state: State, f: np.ndarray, drive: np.ndarray, ticks: float, t_us: int) -> State:
+    """z = F z + drive + w, |w_i| <= ticks b_i: one tick, or the longer step that was. f (n, n), drive (n,).
+
+    drive holds the inputs as applied (saturated: else saturation is taken for model error) and other known terms.
+    """
     x, p = state.x.copy(), state.p.copy()
-    q = gains.q.copy()
+    q = gains.q * max(ticks, 1.0) ** 2
     if recent_inflations(state, t_us) > HALF_ABOVE:
         for i in range(q.shape[0]):
             if gains.is_f[i]:
@@ -168,21 +155,32 @@ def predict(gains: Gains, state: State, f: np.ndarray, drive: np.ndarray, t_us: 
 @kernel
 def update(gains: Gains, state: State, y: np.ndarray, late: np.ndarray, t_us: int) -> State:
     """Intersect with what arrived. y (m,), NaN or inf where nothing (usable) did; late (m,) >= 0 widens e: |rate| x age."""
-    arrived = 0
-    for i in range(y.shape[0]):
-        if math.isfinite(y[i]):
-            arrived += 1
-    if arrived == 0:
+    if not np.isfinite(y).any():
         return state
-    x, p = state.x.copy(), state.p.copy()
-    n_bad, inflated_us = state.n_bad.copy(), state.inflated_us.copy()
-    if gains.form == STRIPS:
-        empty, inflations, delta = _update_strips(gains, x, p, y, late, n_bad)
-    else:
-        empty, inflations, delta = _update_joint(gains, x, p, y, late, arrived, n_bad)
+    x, p, n_bad = state.x.copy(), state.p.copy(), state.n_bad.copy()
+    empty, inflations, delta = _strips(gains, x, p, y, late, n_bad)
+    return judged(gains, state, x, p, n_bad, empty, inflations, delta, t_us)
+
+
+@kernel
+def judged(
+    gains: Gains,
+    state: State,
+    x: np.ndarray,
+    p: np.ndarray,
+    n_bad: np.ndarray,
+    empty: int,
+    inflations: int,
+    delta: float,
+    t_us: int,
+) -> State:
+    """The state after an update that met `empty` contradictions and enlarged the set `inflations` times."""
     ellipsoid.keep_positive(p, gains.inv_s2)
-    for k in range(inflations):
-        inflated_us[(state.inflations + k) % inflated_us.shape[0]] = t_us
+    inflated_us = state.inflated_us
+    if inflations > 0:
+        inflated_us = inflated_us.copy()
+        for k in range(inflations):
+            inflated_us[(state.inflations + k) % inflated_us.shape[0]] = t_us
     clean = 0 if empty > 0 else min(state.clean + 1, CLEAN_UPDATES)
     return State(
         x,
@@ -208,32 +206,7 @@ def half_widths(state: State) -> np.ndarray:
 
 
 @kernel
-def inflation_factor(x: np.ndarray, p: np.ndarray, c: np.ndarray, y: np.ndarray, r: np.ndarray, scaled: bool) -> float:
-    """The smallest factor on P that brings delta of Eq. (26) to 0.2, by bisection; inf where none below 1e30 does."""
-    _, g, rho = ellipsoid.innovation_shape(p, c, r, scaled)
-    m, n = c.shape
-    nu = np.empty(m)
-    for k in range(m):
-        nu[k] = y[k]
-        for j in range(n):
-            nu[k] -= c[k, j] * x[j]
-    ratio = (1.0 - rho) / rho  # sqrt(p_m/r_m), grows with the square root of the factor
-    low, high = 0.0, 0.0
-    while not ellipsoid.joint_delta(math.exp(high) * g, 1.0 / (1.0 + math.exp(0.5 * high) * ratio), r, nu) >= INFLATED_DELTA:
-        low, high = high, high + 1.0
-        if high > 69.0:
-            return math.inf
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        if ellipsoid.joint_delta(math.exp(middle) * g, 1.0 / (1.0 + math.exp(0.5 * middle) * ratio), r, nu) >= INFLATED_DELTA:
-            high = middle
-        else:
-            low = middle
-    return math.exp(high)
-
-
-@kernel
-def _update_strips(
+def _strips(
     gains: Gains, x: np.ndarray, p: np.ndarray, y: np.ndarray, late: np.ndarray, n_bad: np.ndarray
 ) -> tuple[int, int, float]:
     empty, inflations, smallest = 0, 0, math.inf
@@ -261,34 +234,3 @@ def _update_strips(
         inflations += 1
         n_bad[i] = 0
     return empty, inflations, smallest
-
-
-@kernel
-def _update_joint(
-    gains: Gains, x: np.ndarray, p: np.ndarray, y: np.ndarray, late: np.ndarray, arrived: int, n_bad: np.ndarray
-) -> tuple[int, int, float]:
-    n = x.shape[0]
-    c, values, r = np.empty((arrived, n)), np.empty(arrived), np.empty(arrived)
-    row = 0
-    for i in range(y.shape[0]):
-        if math.isfinite(y[i]):
-            for j in range(n):
-                c[row, j] = gains.c[i, j]
-            values[row] = y[i]
-            r[row] = gains.r_factor * arrived * (gains.e[i] + late[i]) ** 2
-            row += 1
-    printed = gains.form == PRINTED
-    delta = ellipsoid.joint(x, p, c, values, r, gains.scaled_outputs, printed)
-    if delta > 0.0:
-        n_bad[0] = 0
-        return 0, 0, delta
-    n_bad[0] += 1
-    if n_bad[0] <= OUTLIERS:
-        return 1, 0, delta
-    n_bad[0] = 0
-    factor = inflation_factor(x, p, c, values, r, gains.scaled_outputs)
-    if not math.isfinite(factor):
-        return 1, 0, delta
-    p *= factor
-    ellipsoid.joint(x, p, c, values, r, gains.scaled_outputs, printed)
-    return 1, 1, delta

@@ -98,9 +98,52 @@ def innovation_shape(p: np.ndarray, c: np.ndarray, r: np.ndarray, scaled: bool) 
         for k in range(m):
             for l in range(m):
                 shape[k, l] = g[k, l] / math.sqrt(r[k] * r[l])
-    p_m = max(np.linalg.eigvalsh(shape).max(), 0.0)
+    p_m = max(largest_eigenvalue(shape), 0.0)
     rho = math.sqrt(r_m) / (math.sqrt(r_m) + math.sqrt(p_m))
     return pct, g, min(max(rho, 1e-9), 1.0 - 1e-9)
+
+
+@kernel
+def innovation(x: np.ndarray, c: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """y - C x, (m,)."""
+    nu = y.copy()
+    for k in range(c.shape[0]):
+        for j in range(c.shape[1]):
+            nu[k] -= c[k, j] * x[j]
+    return nu
+
+
+@kernel
+def largest_eigenvalue(symmetric: np.ndarray) -> float:
+    """Of a small symmetric matrix, by cyclic Jacobi rotations (LAPACK's takes longer to compile than all kernels here)."""
+    a = symmetric.copy()
+    n = a.shape[0]
+    for _ in range(30):
+        off, diagonal = 0.0, 0.0
+        for i in range(n):
+            diagonal += a[i, i] * a[i, i]
+            for j in range(i):
+                off += a[i, j] * a[i, j]
+        if off <= 1e-30 * diagonal:
+            break
+        for i in range(n):
+            for j in range(i):
+                if a[i, j] == 0.0:
+                    continue
+                theta = 0.5 * (a[i, i] - a[j, j]) / a[i, j]
+                t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + math.sqrt(theta * theta + 1.0))
+                cos = 1.0 / math.sqrt(t * t + 1.0)
+                sin = t * cos
+                for k in range(n):
+                    a_ki, a_kj = a[k, i], a[k, j]
+                    a[k, i], a[k, j] = cos * a_ki + sin * a_kj, cos * a_kj - sin * a_ki
+                for k in range(n):
+                    a_ik, a_jk = a[i, k], a[j, k]
+                    a[i, k], a[j, k] = cos * a_ik + sin * a_jk, cos * a_jk - sin * a_ik
+    largest = -math.inf
+    for i in range(n):
+        largest = max(largest, a[i, i])
+    return largest
 
 
 @kernel
@@ -127,11 +170,7 @@ def joint(x: np.ndarray, p: np.ndarray, c: np.ndarray, y: np.ndarray, r: np.ndar
     """
     m, n = c.shape
     pct, g, rho = innovation_shape(p, c, r, scaled)
-    nu = np.empty(m)
-    for k in range(m):
-        nu[k] = y[k]
-        for j in range(n):
-            nu[k] -= c[k, j] * x[j]
+    nu = innovation(x, c, y)
     delta = joint_delta(g, rho, r, nu)
     if not delta > 0.0:
         return delta

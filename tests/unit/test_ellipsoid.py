@@ -97,6 +97,14 @@ def test_the_joint_form_misses_an_empty_set_that_strips_see():
     assert ellipsoid.strip(x, p, c[0], y[0], e[0], np.ones(2)) < 0.0
 
 
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 8))
+def test_largest_eigenvalue_agrees_with_lapack(seed, n):
+    root = np.random.default_rng(seed).normal(size=(n, n)) * 10.0 ** np.random.default_rng(seed).uniform(-4, 4, n)
+    symmetric = root + root.T
+    expected = np.linalg.eigvalsh(symmetric)
+    np.testing.assert_allclose(ellipsoid.largest_eigenvalue(symmetric), expected[-1], atol=1e-12 * np.abs(expected).max())
+
+
 def test_keep_positive_repairs_a_matrix_that_is_not_and_leaves_others_alone():
     good = np.diag([1.0, 1e-9])
     assert not ellipsoid.keep_positive(good, np.ones(2))

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 
-from mavquad.estimate import asmf, augment, ellipsoid, interval
+from mavquad.estimate import asmf, asmf_joint, augment, ellipsoid, interval
 from mavquad.identify import models
 from mavquad.jit import kernel
 
@@ -78,20 +78,19 @@ def contain(variant: str, noise: str, seed: int, *, steps: int = STEPS, b_model:
     else:
         f, g, c, b_all = truth.f, truth.g, truth.c, np.concatenate([np.full(13, b_model), b])
     n = f.shape[0]
-    params = asmf.Params(
-        e=tuple(e), b=tuple(b_all), p0=(float(n),) * n, model_error=tuple(range(13, n)), form=form, scaled_outputs=scaled
-    )
+    params = asmf.Params(e=tuple(e), b=tuple(b_all), p0=(float(n),) * n, model_error=tuple(range(13, n)))
     filter_gains = asmf.gains(params, c)
-    if without_m:
-        filter_gains = filter_gains._replace(r_factor=1.0 / e.size)
+    r = e**2 if without_m else e.size * e**2
     z0 = rng.uniform(-1.0, 1.0, 19)
     w = np.zeros((steps, 19))
     w[:, 13:] = box_noise(rng, noise, steps, b)
     picks = np.array([13 + model.states.index(name) for name in ROWS] if on_all else range(13, 19))
     k = attitude_lqr(model)
     inside, width, error, state = _contain(
+        (form != "strips", scaled, form == "printed"),
         filter_gains,
         asmf.init(filter_gains, np.zeros(n)),
+        r,
         (truth.f, truth.g, truth.c),
         (f, g),
         k,
@@ -132,8 +131,10 @@ def _error_on_every_state(model: models.Model, b: np.ndarray) -> tuple[np.ndarra
 
 @kernel
 def _contain(
+    form: tuple[bool, bool, bool],
     gains: asmf.Gains,
     state: asmf.State,
+    r: np.ndarray,
     truth: tuple[np.ndarray, np.ndarray, np.ndarray],
     model: tuple[np.ndarray, np.ndarray],
     k: np.ndarray,
@@ -143,6 +144,7 @@ def _contain(
     picks: np.ndarray,
 ) -> tuple[int, np.ndarray, np.ndarray, asmf.State]:
     steps, n, n_f = w.shape[0], state.x.shape[0], picks.shape[0]
+    joint, scaled, printed = form
     f_true, g_true, c_true = truth
     f, g = model
     z, on_time = z0.copy(), np.zeros(v.shape[1])
@@ -152,7 +154,10 @@ def _contain(
     for step in range(steps):
         t_us = step * 20_000
         y = v[step] + _times(c_true, z)
-        state = asmf.update(gains, state, y, on_time, t_us)
+        if joint:
+            state = asmf_joint.update(gains, state, y, r, scaled, printed, t_us)
+        else:
+            state = asmf.update(gains, state, y, on_time, t_us)
         for i in range(13):
             padded[i] = z[i]
         for i in range(n_f):
@@ -166,7 +171,7 @@ def _contain(
                 error[i] += abs(state.x[picks[i]] - z[13 + i])
         u = -_times(k, state.x[:13])
         z = _times(f_true, z) + _times(g_true, u) + w[step]
-        state = asmf.predict(gains, state, f, _times(g, u), t_us)
+        state = asmf.predict(gains, state, f, _times(g, u), 1.0, t_us)
     return inside, width / counted, error / counted, state
 
 
@@ -192,7 +197,7 @@ def _decoupled(
     for step in range(steps):
         v += DT_S * error + noise[step, 0]
         error += noise[step, 1]
-        state = asmf.predict(gains, state, f, nothing, step * 20_000)
+        state = asmf.predict(gains, state, f, nothing, 1.0, step * 20_000)
         y = np.array([v + noise[step, 2] if step % 2 == 0 else math.nan, error + noise[step, 3]])
         state = asmf.update(gains, state, y, nothing, step * 20_000)
         scalar = interval.update(interval.predict(scalar, b_f), error + noise[step, 3], gains.e[1])
