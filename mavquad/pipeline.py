@@ -508,8 +508,9 @@ def _setpoint(plan: Plan, f: Flight, command: Command) -> Setpoint:
     q, size = attitude.attitude(thrust, command.yaw_rad)
     # ArduCopter multiplies by 1/cos(tilt) itself: it gets the vertical part only
     specific = thrust[2] if f.life.autopilot == lifecycle.ARDUPILOT else size
-    omega, mask = command.omega_rad_s, 7
-    if math.isfinite(omega[0]):
+    omega, mask = ZERO3, 7
+    if math.isfinite(command.omega_rad_s[0]):
+        omega = command.omega_rad_s
         mask = 128 if plan.settings.loop == "rates" else 0
         if mask == 0 and f.life.autopilot == lifecycle.ARDUPILOT:
             omega = _unrotate(q, omega)
