@@ -125,15 +125,15 @@ class Companion:
             self._address, self._address_us = address, stamp_us
 
     def _act(self, frame: Frame, stamp_us: int) -> None:
-        if self.flight.heartbeat_us:
-            self._emit(
-                pipeline.advance(self.plan, self.flight, stamp_us)
-            )  # timers first: they are logged at their own due time
+        if stamp_us >= self.flight.due_us:  # timers first: they are logged at their own due time
+            self._emit(pipeline.advance(self.plan, self.flight, stamp_us))
         self.log.write(stamp_us, frame.raw)
         self._emit(pipeline.feed(self.plan, self.flight, stamp_us, frame))
 
     def _emit(self, flight: Flight) -> None:
         before, self.flight = self.flight, flight
+        if flight is before:
+            return
         for stamp_us, raw in flight.outbox:
             self.log.write(stamp_us, raw)
             self._to_send.append(raw)
@@ -219,7 +219,8 @@ class Companion:
                     self.latency_us.append(1e6 * (clock.monotonic_s() - begun))
                 last_heard = begun
             if self.flight.heartbeat_us:
-                self._emit(pipeline.advance(self.plan, self.flight, self._stamp_us))
+                if self._stamp_us >= self.flight.due_us:
+                    self._emit(pipeline.advance(self.plan, self.flight, self._stamp_us))
                 self._want_engage(self._stamp_us)
                 self._flush()
             if self._stop and not arrived:
@@ -229,7 +230,7 @@ class Companion:
     def _wait_s(self, now_us: int) -> float:
         if not self.flight.heartbeat_us:
             return 0.2
-        return min(0.2, max(0.0, 1e-6 * (pipeline.next_due_us(self.flight) - now_us)))
+        return min(0.2, max(0.0, 1e-6 * (self.flight.due_us - now_us)))
 
     def _complain(self, silent_s: float) -> None:
         if silent_s > _SILENCE_S and not self._said_silent:

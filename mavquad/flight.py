@@ -27,6 +27,7 @@ class Flight:
     control_gap_us: int  # period of the pacing stream
     epoch: int  # how often the autopilot's clock has started
     stamps: dict[str, int]  # newest vehicle stamp of each kind
+    due_us: int  # arrival time at which the next timer fires
     heartbeat_us: int  # next due, arrival time; 0: not started
     tick_us: int
     timesync_us: int
@@ -72,6 +73,7 @@ def start(plan: Plan) -> Flight:
     f.life = f.life._replace(rates=tuple(r._replace(msgid=_message_id(r.name)) for r in f.life.rates))
     f.seq, f.arrival_us, f.epoch = 0, 0, 0
     f.heartbeat_us = f.tick_us = f.timesync_us = f.publish_us = 0
+    f.due_us = 1 << 62
     f.counts = {}
     f.hover_thrust, f.delay_s = plan.airframe.hover_thrust, 0.0
     f.battery_percent = math.nan

@@ -6,7 +6,6 @@ stamped at or after it. So a replay of the received frames gives every sent fram
 """
 
 import math
-import zlib
 from collections.abc import Callable
 from typing import Any
 
@@ -20,7 +19,7 @@ from mavquad.setpoint import attitude, limits
 from mavquad.signals import NAN3, ZERO3, Applied, Attitude, Command, Demand, Position, Setpoint, Target, Vec3
 from mavquad.wire import Frame
 
-__all__ = ["Flight", "Plan", "accepts", "advance", "build", "feed", "next_due_us", "start"]
+__all__ = ["Flight", "Plan", "accepts", "advance", "build", "feed", "start"]
 
 G_M_S2 = attitude.G_M_S2
 _TICK_US = 100_000  # life cycle and watchdog
@@ -31,47 +30,45 @@ _LATE_US = 2_000_000  # a stamp further back than this is a restarted clock, not
 # ---- the two entries ----------------------------------------------------------------------------------------------------
 def advance(plan: Plan, flight: Flight, until_us: int) -> Flight:
     """Fire every timer due at or before `until_us` (arrival time), each at its own due time."""
-    plan = flight.tuned or plan
-    if until_us < next_due_us(flight):
-        if until_us > flight.arrival_us or flight.outbox or flight.trace:
-            flight = flight.clone()
-            flight.arrival_us = max(flight.arrival_us, until_us)
+    if until_us < flight.due_us and not flight.outbox and not flight.trace:
         return flight
     f = flight.clone()
-    while True:
-        due = next_due_us(f)
-        if due > until_us:
-            break
-        f.arrival_us = max(f.arrival_us, due)
-        _fire(plan, f, f.arrival_us)
-    f.arrival_us = max(f.arrival_us, until_us)
+    _pass_time(flight.tuned or plan, f, until_us)
     return f
 
 
 def feed(plan: Plan, flight: Flight, arrival_us: int, frame: Frame) -> Flight:
-    """Timers up to the arrival, then the frame. What is to be sent is in `.outbox` as (stamp, frame), trace rows in `.trace`."""
+    """Timers up to the arrival, then the frame. What is to be sent is in `.outbox` as (stamp, frame), trace rows in `.trace`.
+
+    A frame that concerns no stage changes nothing.
+    """
     plan = flight.tuned or plan
+    handler = _HANDLERS.get(frame.msgid)
+    name = plan.samples.get(frame.msgid)
+    known = frame.msgid in wire.ID_SET
+    if handler is None and name is None and known:
+        return advance(plan, flight, arrival_us)
     f = flight.clone()
     if not f.heartbeat_us:  # the first event starts the clockwork
         f.heartbeat_us = f.tick_us = f.timesync_us = f.publish_us = arrival_us
-    while True:
-        due = next_due_us(f)
-        if due > arrival_us:
-            break
-        f.arrival_us = max(f.arrival_us, due)
-        _fire(plan, f, f.arrival_us)
-    f.arrival_us = max(f.arrival_us, arrival_us)
-    f.heard_crc = zlib.crc32(frame.raw, f.heard_crc)
-    handler = _HANDLERS.get(frame.msgid)
+        f.due_us = arrival_us
+    _pass_time(plan, f, arrival_us)
     if handler is not None:
         handler(plan, f, frame, wire.decode(frame))
+    elif not known:
+        _count(f, "unknown message")
     elif (frame.system, frame.component) == f.life.target:
-        name = plan.samples.get(frame.msgid)
-        if name is not None:
-            _sample(plan, f, name, wire.decode(frame))
-        elif frame.msgid not in wire.ID_SET:
-            _count(f, "unknown message")
+        _sample(plan, f, str(name), wire.decode(frame))
+    f.due_us = _next_due_us(f)
     return f
+
+
+def _pass_time(plan: Plan, f: Flight, until_us: int) -> None:
+    while f.due_us <= until_us:
+        f.arrival_us = max(f.arrival_us, f.due_us)
+        _fire(plan, f, f.arrival_us)
+        f.due_us = _next_due_us(f)
+    f.arrival_us = max(f.arrival_us, until_us)
 
 
 def accepts(plan: Plan, flight: Flight, frame: Frame) -> str:
@@ -122,10 +119,7 @@ def _count(f: Flight, what: str) -> None:
 
 
 # ---- time ---------------------------------------------------------------------------------------------------------------
-def next_due_us(f: Flight) -> int:
-    """Arrival time at which the next timer fires; far away before the first event."""
-    if not f.heartbeat_us:
-        return 1 << 62
+def _next_due_us(f: Flight) -> int:
     due = min(f.heartbeat_us, f.tick_us, f.timesync_us, f.publish_us)
     life_due = lifecycle.due_us(f.life)
     return min(due, max(life_due, f.arrival_us)) if life_due else due
