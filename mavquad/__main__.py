@@ -29,12 +29,13 @@ def run(args: argparse.Namespace) -> int:
     from mavquad.link.endpoint import open_endpoint
 
     endpoint = open_endpoint(args.endpoint)  # first: what is wrong with it is known before anything is compiled
-    from mavquad import config, pipeline, plan_file, settings
+    from mavquad import config, pipeline, plan_file, settings, warm
     from mavquad.companion import Companion
 
     chosen = config.load(args.config, settings.Companion) if args.config else settings.Companion()
     plan = pipeline.build(chosen)
     folder = args.run or Path("runs") / f"{clock.stamp()}-companion"
+    warm.run(plan)  # compile or load before anybody waits for an answer
     companion = Companion(plan, endpoint, folder, lockstep=args.lockstep, engage=args.engage)
     try:
         plan_file.write(plan_file.beside(companion.log.path), plan.settings, plan.airframe)

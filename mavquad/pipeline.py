@@ -6,6 +6,7 @@ stamped at or after it. So a replay of the received frames gives every sent fram
 """
 
 import math
+import zlib
 from collections.abc import Callable
 from typing import Any
 
@@ -19,7 +20,7 @@ from mavquad.setpoint import attitude, limits
 from mavquad.signals import NAN3, ZERO3, Applied, Attitude, Command, Demand, Position, Setpoint, Target, Vec3
 from mavquad.wire import Frame
 
-__all__ = ["Flight", "Plan", "accepts", "advance", "build", "feed", "start"]
+__all__ = ["Flight", "Plan", "accepts", "advance", "anchor", "build", "feed", "start"]
 
 G_M_S2 = attitude.G_M_S2
 _TICK_US = 100_000  # life cycle and watchdog
@@ -40,15 +41,17 @@ def advance(plan: Plan, flight: Flight, until_us: int) -> Flight:
 def feed(plan: Plan, flight: Flight, arrival_us: int, frame: Frame) -> Flight:
     """Timers up to the arrival, then the frame. What is to be sent is in `.outbox` as (stamp, frame), trace rows in `.trace`.
 
-    A frame that concerns no stage changes nothing.
+    A frame that concerns no stage changes no more than the check sum of all that was heard, which the trace carries.
     """
     plan = flight.tuned or plan
     handler = _HANDLERS.get(frame.msgid)
     name = plan.samples.get(frame.msgid)
     known = frame.msgid in wire.ID_SET
-    if handler is None and name is None and known:
-        return advance(plan, flight, arrival_us)
     f = flight.clone()
+    f.heard_crc = zlib.crc32(frame.raw, f.heard_crc)
+    if handler is None and name is None and known:
+        _pass_time(plan, f, arrival_us)
+        return f
     if not f.heartbeat_us:  # the first event starts the clockwork
         f.heartbeat_us = f.tick_us = f.timesync_us = f.publish_us = arrival_us
         f.due_us = arrival_us
@@ -166,7 +169,7 @@ def _tick(plan: Plan, f: Flight, now_us: int) -> None:
     f.life, sends = lifecycle.on_tick(f.life, sight, now_us, plan.settings)
     _send_all(plan, f, sends)
     if f.life.state == STREAMING and before.state != STREAMING:
-        _anchor(plan, f)
+        anchor(plan, f)
     if f.life.state == ENGAGED and before.state != ENGAGED:
         f.path_t0_us = f.now_us + round(1e6 * plan.settings.settle_s)
     if f.life.state in (STREAMING, ENGAGED):
@@ -440,7 +443,7 @@ def _recognise(f: Flight, target: Target) -> None:
 
 
 # ---- control ----------------------------------------------------------------------------------------------------------------
-def _anchor(plan: Plan, f: Flight) -> None:
+def anchor(plan: Plan, f: Flight) -> None:
     """Where the path begins, and a first setpoint that changes nothing."""
     e = f.estimate
     p = f.position.p_ned_m if f.position else ZERO3

@@ -85,7 +85,7 @@ def trace_row(
         float(t_us), float(f.arrival_us), float(_STATES.index(f.life.state)),
         *estimate.p_ned_m, *estimate.v_ned_m_s, *estimate.q_wxyz, *estimate.omega_rad_s, *estimate.f_ned_m_s2, *estimate.tau_rad_s2,
         *demand.p_ned_m, *demand.v_ned_m_s, *demand.a_ned_m_s2, *nominal.a_ned_m_s2, *command.a_ned_m_s2,
-        *(sent.q_wxyz if sent else (math.nan,) * 4), sent.thrust if sent else math.nan, float(bits), f.hover_thrust, f.delay_s,
+        *(sent.q_wxyz if sent else (math.nan,) * 4), sent.thrust if sent else math.nan, float(bits), f.hover_thrust, f.delay_s, float(f.heard_crc),
     )  # fmt: skip
     for stage, state in zip(plan.observers, f.observers, strict=True):
         row += stage.module.read(stage.gains, state, t_us)[1]
