@@ -28,6 +28,7 @@ Cost = Literal["ml", "cifer"]
 SD_FLOOR = 0.002
 COHERENCE_FLOOR = 0.5
 FEWEST_POINTS = 5
+CHI2_BAND = (0.7, 1.6)  # outside, the spread is scaled and the model flagged
 
 
 class Fit(NamedTuple):
@@ -55,7 +56,7 @@ class Fit(NamedTuple):
     @property
     def trusted(self) -> bool:
         """chi2 in its band and at least two starts (where there were two) in one minimum."""
-        return 0.7 <= self.chi2 <= 1.6 and self.agreeing >= min(2, self.starts)
+        return CHI2_BAND[0] <= self.chi2 <= CHI2_BAND[1] and self.agreeing >= min(2, self.starts)
 
 
 # ---- the model's response --------------------------------------------------------------------------------------------
@@ -213,14 +214,27 @@ def fit(
     sampled: bool = True,
     evaluations: int = 80,
 ) -> Fit:
-    """Fit from every start (the regression's own unless given) and keep the smallest cost. Raises LogError on too little data."""
+    """Fit from every start (the regression's own unless given) and keep the smallest cost. Raises LogError on too little data.
+
+    Where fewer than two of the regression's starts end in the same minimum, or that minimum does not explain the data (chi2 above
+    1.6), more of them are tried.
+    """
     task = problem(structure, response, sampled=sampled)
-    if starts is None:
-        starts = ranked_starts(task, families(structure, response))
-    runs = [minimise(task, start, cost, evaluations) for start in starts]
+
+    def search(these: Sequence[np.ndarray]) -> list[tuple[np.ndarray, float, int]]:
+        return [minimise(task, start, cost, evaluations) for start in these]
+
+    runs = search(ranked_starts(task, families(structure, response)) if starts is None else starts)
     best = min(runs, key=lambda run: run[1])
-    agreeing = sum(run[1] <= 1.01 * best[1] + 1e-9 for run in runs)
-    return _finished(task, best[0], agreeing, len(runs), sum(run[2] for run in runs))
+    if starts is None and (_agreeing(runs) < 2 or _chi2(task, cost_of(task, best[0])) > CHI2_BAND[1]):
+        runs += search(ranked_starts(task, families(structure, response, between=True)))
+        best = min(runs, key=lambda run: run[1])
+    return _finished(task, best[0], _agreeing(runs), len(runs), sum(run[2] for run in runs))
+
+
+def _agreeing(runs: Sequence[tuple[np.ndarray, float, int]]) -> int:
+    least = min(run[1] for run in runs)
+    return sum(run[1] <= 1.01 * least + 1e-9 for run in runs)
 
 
 def relaxed(
@@ -243,16 +257,20 @@ def relaxed(
     return theta, s + 1
 
 
+def _chi2(task: Problem, ml: float) -> float:
+    return ml / max(1, 2 * task.target.size - len(task.structure.free))
+
+
 def _finished(task: Problem, theta: np.ndarray, agreeing: int, starts: int, evaluations: int) -> Fit:
     r = residuals(task, theta)
     slope = jacobian(task, theta)
     scale = np.maximum(np.linalg.norm(slope, axis=0), 1e-300)
     inverse = np.linalg.pinv(slope / scale)
     cov = inverse @ inverse.T / np.outer(scale, scale)
-    chi2 = float(r @ r) / max(1, r.size - theta.size)
+    chi2 = _chi2(task, float(r @ r))
     sd = np.sqrt(np.diag(cov))
     correlation = cov / np.outer(sd, sd)
-    if not 0.7 <= chi2 <= 1.6:
+    if not CHI2_BAND[0] <= chi2 <= CHI2_BAND[1]:
         sd = sd * np.sqrt(chi2)
     return Fit(
         task.structure, theta, sd, correlation, chi2, cost_of(task, theta, "cifer"), float(r @ r), agreeing, starts, evaluations

@@ -26,14 +26,21 @@ class Family(NamedTuple):
     starts: tuple[np.ndarray, ...]
 
 
-def families(structure: Structure, response: Response) -> list[Family]:
-    """Starts for a rotor axis (outputs speed, rate, angle) or for yaw and heave, grouped by their first time constant."""
+def families(structure: Structure, response: Response, *, between: bool = False) -> list[Family]:
+    """Starts for a rotor axis (outputs speed, rate, angle) or for yaw and heave, grouped by their first time constant.
+
+    Seven families; with `between` the six that lie between those, for when the seven do not agree.
+    """
+
+    def grid(lo: float, hi: float) -> np.ndarray:
+        return np.geomspace(lo, hi, 13)[1::2] if between else np.geomspace(lo, hi, 7)
+
     if "K_rfb" in structure.free:
-        return [Family((_yaw_heave(structure, response, k),)) for k in np.geomspace(1.0, 30.0, 7)]
+        return [Family((_yaw_heave(structure, response, k),)) for k in grid(1.0, 30.0)]
     if "tau_s" in structure.free:
         slow = np.geomspace(0.18, 1.2, 6)
-        return [Family(tuple(_rotor(structure, response, f, s) for s in slow)) for f in np.geomspace(0.02, 0.15, 7)]
-    return [Family((_rotor(structure, response, tau, tau),)) for tau in np.geomspace(0.1, 1.5, 7)]
+        return [Family(tuple(_rotor(structure, response, f, s) for s in slow)) for f in grid(0.02, 0.15)]
+    return [Family((_rotor(structure, response, tau, tau),)) for tau in grid(0.1, 1.5)]
 
 
 def literal_regression(state: np.ndarray, columns: np.ndarray, dt_s: float) -> np.ndarray:
