@@ -199,7 +199,7 @@ def _attitude(gains: Gains, state: State, t_us: int, q_wxyz: Quat) -> State:
 
 def _bad_stamp(state: State) -> State:
     ints = state.ints.copy()
-    ints[Counts._fields.index("bad_stamp")] += 1
+    ints[gsmo_stream.BAD_STAMP] += 1
     return state._replace(ints=ints)
 
 
@@ -249,10 +249,10 @@ def run_record(
         got = None if torque_rad_s2 is None else torque_rad_s2.shape
         raise ConfigError(f"gsmo.run_record: {n} stamps need q_wxyz ({n}, 4) and torque ({n}, 3), got {q_wxyz.shape} and {got}")
     a = np.zeros((0, 3)) if torque_rad_s2 is None else np.ascontiguousarray(torque_rad_s2, dtype=np.float64)
-    omega, q, ints = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros(gsmo_core.INTS, np.int64)
+    omega, q, counts = np.zeros((n, 3)), np.zeros((n, 4)), np.zeros(len(Counts._fields), np.int64)
     stamps, samples = np.ascontiguousarray(t_us, dtype=np.int64), np.ascontiguousarray(q_wxyz, dtype=np.float64)
     if gains.online:
-        gsmo_core.run_online(gains.gyro, gains.tick_s, stamps, samples, a, omega, q, ints)
+        gsmo_core.run_online(gains.gyro, gains.tick_s, stamps, samples, a, omega, q, counts)
     else:
-        gsmo_core.run(gains.fixed, stamps, samples, a, omega, q, ints)
-    return omega, q, Counts(*ints[: len(Counts._fields)].tolist())
+        gsmo_core.run(gains.fixed, stamps, samples, a, omega, q, counts)
+    return omega, q, Counts(*counts.tolist())

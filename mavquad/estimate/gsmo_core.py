@@ -84,23 +84,26 @@ def sane(q: Quat, w: Vec3, d: Vec3) -> bool:
 
 
 @kernel
-def on_attitude(gains: Fixed, stream: Stream, core: Core, t_us: int, q: Quat) -> tuple[Stream, Core]:
-    """One attitude sample, whatever it is worth."""
-    verdict, stream, dt_s, unit, a = gsmo_stream.admit(stream, t_us, q)
+def on_attitude(gains: Fixed, stream: Stream, core: Core, counts: np.ndarray, t_us: int, q: Quat) -> tuple[Stream, Core]:
+    """One attitude sample, whatever it is worth. counts in place."""
+    verdict, what, stream, dt_s, unit, a = gsmo_stream.admit(stream, t_us, q)
+    gsmo_stream.tally(counts, what)
     if verdict == gsmo_stream.REFUSED:
         return stream, core
     if verdict == gsmo_stream.FIRST:
         return stream, begin(unit)
     core = take(gains, advance(gains, core, stream.clock.period_s, a, dt_s), unit, dt_s)
     if not sane(core.q, core.w, core.d):
+        gsmo_stream.tally(counts, gsmo_stream.LOST)
         return gsmo_stream.lost(stream), begin(unit)
     return stream, core
 
 
 @kernel
-def on_attitude_online(gyro: Vec3, tick_s: float, stream: Stream, bank: Bank, t_us: int, q: Quat) -> Stream:
-    """One attitude sample for the bank, which is changed in place."""
-    verdict, stream, dt_s, unit, a = gsmo_stream.admit(stream, t_us, q)
+def on_attitude_online(gyro: Vec3, tick_s: float, stream: Stream, bank: Bank, counts: np.ndarray, t_us: int, q: Quat) -> Stream:
+    """One attitude sample for the bank. counts and bank in place."""
+    verdict, what, stream, dt_s, unit, a = gsmo_stream.admit(stream, t_us, q)
+    gsmo_stream.tally(counts, what)
     if verdict == gsmo_stream.REFUSED:
         return stream
     if verdict == gsmo_stream.FIRST:
@@ -111,6 +114,7 @@ def on_attitude_online(gyro: Vec3, tick_s: float, stream: Stream, bank: Bank, t_
     gsmo_online.correct(bank, unit, dt_s, period_s, stream.clock.fresh - 1)
     q_hat, w_hat = gsmo_online.mixed(bank)
     if not sane(q_hat, w_hat, (0.0, 0.0, 0.0)):
+        gsmo_stream.tally(counts, gsmo_stream.LOST)
         gsmo_online.start(bank, unit)
         return gsmo_stream.lost(stream)
     return stream
@@ -150,11 +154,11 @@ def unpack_core(ints: np.ndarray, floats: np.ndarray) -> Core:
 @kernel
 def sample(g: tuple, ints: np.ndarray, floats: np.ndarray, t_us: int, q: Quat) -> tuple[np.ndarray, np.ndarray]:
     """One attitude sample for a fixed-gain variant: new arrays."""
-    stream, core = on_attitude(fixed(g), gsmo_stream.unpack(ints, floats), unpack_core(ints, floats), t_us, q)
-    new_ints, new_floats = np.empty_like(ints), np.empty_like(floats)
-    gsmo_stream.pack(stream, new_ints, new_floats)
-    pack_core(core, new_ints, new_floats)
-    return new_ints, new_floats
+    ints, floats = ints.copy(), floats.copy()
+    stream, core = on_attitude(fixed(g), gsmo_stream.unpack(ints, floats), unpack_core(ints, floats), ints, t_us, q)
+    gsmo_stream.pack(stream, ints, floats)
+    pack_core(core, ints, floats)
+    return ints, floats
 
 
 @kernel
@@ -162,19 +166,22 @@ def sample_online(
     gyro: Vec3, tick_s: float, ints: np.ndarray, floats: np.ndarray, bank: tuple, t_us: int, q: Quat
 ) -> tuple[np.ndarray, np.ndarray, tuple]:
     """One attitude sample for the bank: new arrays."""
+    ints, floats = ints.copy(), floats.copy()
     after = gsmo_online.copy(Bank(*bank))
-    stream = on_attitude_online(gyro, tick_s, gsmo_stream.unpack(ints, floats), after, t_us, q)
-    new_ints, new_floats = ints.copy(), floats.copy()
-    gsmo_stream.pack(stream, new_ints, new_floats)
-    return new_ints, new_floats, (after.x, after.p, after.v, after.weight, after.scale, after.best)
+    stream = on_attitude_online(gyro, tick_s, gsmo_stream.unpack(ints, floats), after, ints, t_us, q)
+    gsmo_stream.pack(stream, ints, floats)
+    return ints, floats, (after.x, after.p, after.v, after.weight, after.scale, after.best)
 
 
 @kernel
 def torque_sample(ints: np.ndarray, floats: np.ndarray, t_us: int, a: Vec3) -> tuple[np.ndarray, np.ndarray]:
     """One torque over inertia [rad/s^2]: new arrays."""
-    new_ints, new_floats = ints.copy(), floats.copy()
-    gsmo_stream.pack(gsmo_stream.heard_torque(gsmo_stream.unpack(ints, floats), t_us, a), new_ints, new_floats)
-    return new_ints, new_floats
+    ints, floats = ints.copy(), floats.copy()
+    used, stream = gsmo_stream.heard_torque(gsmo_stream.unpack(ints, floats), t_us, a)
+    if not used:
+        gsmo_stream.tally(ints, gsmo_stream.BAD_TORQUE)
+    gsmo_stream.pack(stream, ints, floats)
+    return ints, floats
 
 
 @kernel
@@ -210,18 +217,16 @@ def predict_online(
 # ---- whole records ---------------------------------------------------------------------------------------------------------
 @kernel
 def run(
-    g: tuple, t_us: np.ndarray, q_wxyz: np.ndarray, a: np.ndarray, omega: np.ndarray, q_out: np.ndarray, ints: np.ndarray
+    g: tuple, t_us: np.ndarray, q_wxyz: np.ndarray, a: np.ndarray, omega: np.ndarray, q_out: np.ndarray, counts: np.ndarray
 ) -> None:
-    """A fixed-gain variant over a record; a (n,3) or (0,3). Fills omega, q_out and the packed stream's integers."""
+    """A fixed-gain variant over a record; a (n,3) or (0,3). Fills omega and q_out, tallies counts."""
     gains, stream, core = fixed(g), gsmo_stream.init(), begin((1.0, 0.0, 0.0, 0.0))
-    floats = np.zeros(FLOATS)
     for k in range(len(t_us)):
-        stream, core = on_attitude(gains, stream, core, t_us[k], (q_wxyz[k, 0], q_wxyz[k, 1], q_wxyz[k, 2], q_wxyz[k, 3]))
-        if len(a) > 0:
-            stream = gsmo_stream.heard_torque(stream, t_us[k], (a[k, 0], a[k, 1], a[k, 2]))
+        q = (q_wxyz[k, 0], q_wxyz[k, 1], q_wxyz[k, 2], q_wxyz[k, 3])
+        stream, core = on_attitude(gains, stream, core, counts, t_us[k], q)
+        stream = _heard(stream, counts, t_us, a, k)
         omega[k, 0], omega[k, 1], omega[k, 2] = core.w
         q_out[k, 0], q_out[k, 1], q_out[k, 2], q_out[k, 3] = core.q
-    gsmo_stream.pack(stream, ints, floats)
 
 
 @kernel
@@ -233,17 +238,25 @@ def run_online(
     a: np.ndarray,
     omega: np.ndarray,
     q_out: np.ndarray,
-    ints: np.ndarray,
+    counts: np.ndarray,
 ) -> None:
     """The bank over a record, likewise."""
     stream, bank = gsmo_stream.init(), gsmo_online.new((1.0, 0.0, 0.0, 0.0))
-    floats = np.zeros(FLOATS)
     for k in range(len(t_us)):
         q = (q_wxyz[k, 0], q_wxyz[k, 1], q_wxyz[k, 2], q_wxyz[k, 3])
-        stream = on_attitude_online(gyro, tick_s, stream, bank, t_us[k], q)
-        if len(a) > 0:
-            stream = gsmo_stream.heard_torque(stream, t_us[k], (a[k, 0], a[k, 1], a[k, 2]))
+        stream = on_attitude_online(gyro, tick_s, stream, bank, counts, t_us[k], q)
+        stream = _heard(stream, counts, t_us, a, k)
         q_hat, w_hat = gsmo_online.mixed(bank)
         omega[k, 0], omega[k, 1], omega[k, 2] = w_hat
         q_out[k, 0], q_out[k, 1], q_out[k, 2], q_out[k, 3] = q_hat
-    gsmo_stream.pack(stream, ints, floats)
+
+
+@kernel
+def _heard(stream: Stream, counts: np.ndarray, t_us: np.ndarray, a: np.ndarray, k: int) -> Stream:
+    """The torque of row k, where there is one."""
+    if len(a) == 0:
+        return stream
+    used, stream = gsmo_stream.heard_torque(stream, t_us[k], (a[k, 0], a[k, 1], a[k, 2]))
+    if not used:
+        gsmo_stream.tally(counts, gsmo_stream.BAD_TORQUE)
+    return stream

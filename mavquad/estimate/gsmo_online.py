@@ -61,15 +61,19 @@ def copy(bank: Bank) -> Bank:
 @kernel
 def start(bank: Bank, q: Quat) -> None:
     """The first sample: every member at it, at rest; nothing judged yet."""
-    bank.x[:] = 0.0
-    bank.p[:] = 0.0
-    bank.p[:, 0] = 1.0
-    bank.v[:] = 0.0
-    bank.weight[:] = 1.0 / MEMBERS
-    bank.scale[:] = 0.0
-    bank.best[:] = 0.0
     for i in range(MEMBERS):
         put_attitude(bank, i, q)
+        for j in range(4, 10):
+            bank.x[i, j] = 0.0
+        for j in range(3):
+            bank.v[i, j] = 0.0
+            bank.weight[i, j] = 1.0 / MEMBERS
+    for i in range(LINEAR):
+        bank.p[i, 0] = 1.0
+        for j in range(1, 6):
+            bank.p[i, j] = 0.0
+    bank.scale[0], bank.scale[1], bank.scale[2] = 0.0, 0.0, 0.0
+    bank.best[0], bank.best[1] = 0.0, 0.0
 
 
 @kernel
@@ -137,18 +141,16 @@ def linear_gains(bank: Bank, i: int, T: float, period_s: float) -> Vec3:
 def third_order(bank: Bank, j: int, r: Vec3, T: float) -> Vec3:
     """Correction of third-order member j (0 ...): rates and torque state in place; the attitude's share is given back."""
     i = LINEAR + j
-    out = (0.0, 0.0, 0.0)
     y0, w0, d0 = gsmo_implicit.correct_axis(gsmo_implicit.THIRD_ORDER, 0.0, 0.0, JERK[j], -r[0], T)
     y1, w1, d1 = gsmo_implicit.correct_axis(gsmo_implicit.THIRD_ORDER, 0.0, 0.0, JERK[j], -r[1], T)
     y2, w2, d2 = gsmo_implicit.correct_axis(gsmo_implicit.THIRD_ORDER, 0.0, 0.0, JERK[j], -r[2], T)
-    out = (r[0] + y0, r[1] + y1, r[2] + y2)
     bank.x[i, 4] -= w0
     bank.x[i, 5] -= w1
     bank.x[i, 6] -= w2
     bank.x[i, 7] -= d0
     bank.x[i, 8] -= d1
     bank.x[i, 9] -= d2
-    return out
+    return (r[0] + y0, r[1] + y1, r[2] + y2)
 
 
 @kernel

@@ -15,6 +15,7 @@ from mavquad.jit import kernel
 from mavquad.quat import Quat, Vec3
 
 REFUSED, FIRST, NEXT = 0, 1, 2  # verdicts on a sample
+ACCEPTED, NOT_FINITE, BAD_NORM, DUPLICATE, LATE, GAP, RESTART, LOST, BAD_TORQUE, BAD_STAMP = range(10)  # places in Counts
 
 MIN_PERIOD_US = 100  # closer stamps are one sample sent twice
 MAX_GAP_US = 20_000_000  # after a longer silence the observer starts afresh
@@ -62,48 +63,38 @@ class Torque(NamedTuple):
 class Stream(NamedTuple):
     clock: Clock
     torque: Torque
-    counts: Counts
 
 
 @kernel
 def init() -> Stream:
     zero = (0.0, 0.0, 0.0)
-    return Stream(Clock(0, 0, 0.0, 0, 0.0, 0, 0), Torque(zero, 0, 0, zero), Counts(0, 0, 0, 0, 0, 0, 0, 0, 0, 0))
+    return Stream(Clock(0, 0, 0.0, 0, 0.0, 0, 0), Torque(zero, 0, 0, zero))
 
 
 @kernel
-def count(c: Counts, what: int) -> Counts:
-    """One more of the kind at this place of Counts."""
-    return Counts(
-        c.accepted + int(what == 0),
-        c.not_finite + int(what == 1),
-        c.bad_norm + int(what == 2),
-        c.duplicate + int(what == 3),
-        c.late + int(what == 4),
-        c.gaps + int(what == 5),
-        c.restarts + int(what == 6),
-        c.lost + int(what == 7),
-        c.bad_torque + int(what == 8),
-        c.bad_stamp + int(what == 9),
-    )
+def tally(counts: np.ndarray, what: int) -> None:
+    """One more in counts, in place; a sample after a gap or a restart is an accepted one too."""
+    counts[what] += 1
+    if what in (GAP, RESTART):
+        counts[ACCEPTED] += 1
 
 
 @kernel
-def begin(s: Stream, t_us: int, c: Counts) -> Stream:
+def begin(s: Stream, t_us: int) -> Stream:
     """The stream after a first sample. The torque last heard goes on to count."""
     clock = Clock(t_us, 1, 0.0, 0, 0.0, 0, 0)
-    return Stream(clock, Torque(s.torque.now, t_us, t_us, (0.0, 0.0, 0.0)), count(c, 0))
+    return Stream(clock, Torque(s.torque.now, t_us, t_us, (0.0, 0.0, 0.0)))
 
 
 @kernel
-def late(s: Stream, t_us: int) -> tuple[int, Stream]:
+def late(s: Stream, t_us: int) -> tuple[int, int, Stream]:
     """Judge a sample that is older than the last accepted one."""
     c = s.clock
     run = c.late_run + 1 if c.late_run > 0 and t_us > c.late_t_us else 1
     if run >= LATE_RUN:
-        return FIRST, begin(s, t_us, count(s.counts, 6))
+        return FIRST, RESTART, begin(s, t_us)
     clock = Clock(c.t_us, c.fresh, c.period_s, c.slow, c.slow_s, run, t_us)
-    return REFUSED, Stream(clock, s.torque, count(s.counts, 4))
+    return REFUSED, LATE, Stream(clock, s.torque)
 
 
 @kernel
@@ -129,67 +120,63 @@ def integrate_torque(torque: Torque, until_us: int) -> Torque:
 
 
 @kernel
-def admit(s: Stream, t_us: int, q: Quat) -> tuple[int, Stream, float, Quat, Vec3]:
-    """Judge one sample: (verdict, stream, seconds since the last, unit quaternion, mean torque over inertia since the last)."""
+def admit(s: Stream, t_us: int, q: Quat) -> tuple[int, int, Stream, float, Quat, Vec3]:
+    """Judge one sample: (verdict, place in Counts, stream, seconds since the last, unit quaternion, mean torque over inertia)."""
     zero = (0.0, 0.0, 0.0)
     n = quat.norm(q)
     if not math.isfinite(n):
-        return REFUSED, Stream(s.clock, s.torque, count(s.counts, 1)), 0.0, q, zero
+        return REFUSED, NOT_FINITE, s, 0.0, q, zero
     if abs(n - 1.0) > 0.05:
-        return REFUSED, Stream(s.clock, s.torque, count(s.counts, 2)), 0.0, q, zero
+        return REFUSED, BAD_NORM, s, 0.0, q, zero
     unit = (q[0] / n, q[1] / n, q[2] / n, q[3] / n)
-    if s.clock.fresh == 0:
-        return FIRST, begin(s, t_us, s.counts), 0.0, unit, zero
     elapsed_us = t_us - s.clock.t_us
-    if elapsed_us < -MIN_PERIOD_US:
-        verdict, after = late(s, t_us)
-        return verdict, after, 0.0, unit, zero
-    if elapsed_us <= MIN_PERIOD_US:
-        return REFUSED, Stream(s.clock, s.torque, count(s.counts, 3)), 0.0, unit, zero
+    if s.clock.fresh == 0:
+        return FIRST, ACCEPTED, begin(s, t_us), 0.0, unit, zero
     if elapsed_us > MAX_GAP_US:
-        return FIRST, begin(s, t_us, count(s.counts, 6)), 0.0, unit, zero
+        return FIRST, RESTART, begin(s, t_us), 0.0, unit, zero
+    if elapsed_us < -MIN_PERIOD_US:
+        verdict, what, after = late(s, t_us)
+        return verdict, what, after, 0.0, unit, zero
+    if elapsed_us <= MIN_PERIOD_US:
+        return REFUSED, DUPLICATE, s, 0.0, unit, zero
     dt_s = 1e-6 * elapsed_us
-    counts = count(s.counts, 0)
-    if s.clock.fresh > 1 and dt_s >= GAP_PERIODS * s.clock.period_s:
-        counts = count(counts, 5)
+    what = GAP if s.clock.fresh > 1 and dt_s >= GAP_PERIODS * s.clock.period_s else ACCEPTED
     torque = integrate_torque(s.torque, t_us)
     mean = torque.now
     if torque.since_us > torque.from_us:
         mean = linalg.scale(1e6 / (torque.since_us - torque.from_us), torque.total)
     torque = Torque(torque.now, torque.since_us, torque.since_us, zero)
-    return NEXT, Stream(advance_clock(s.clock, t_us, dt_s), torque, counts), dt_s, unit, mean
+    return NEXT, what, Stream(advance_clock(s.clock, t_us, dt_s), torque), dt_s, unit, mean
 
 
 @kernel
-def heard_torque(s: Stream, t_us: int, a: Vec3) -> Stream:
-    """A new torque over inertia [rad/s^2] from t_us on; one that is not finite, absurd or of another time is counted only."""
+def heard_torque(s: Stream, t_us: int, a: Vec3) -> tuple[bool, Stream]:
+    """A new torque over inertia [rad/s^2] from t_us on; False, and unused, where it is not finite, absurd or of another time."""
     size = abs(a[0]) + abs(a[1]) + abs(a[2])
     if not size <= MAX_TORQUE_RAD_S2 or (s.clock.fresh > 0 and abs(t_us - s.clock.t_us) > MAX_GAP_US):
-        return Stream(s.clock, s.torque, count(s.counts, 8))
+        return False, s
     if s.clock.fresh == 0:
-        return Stream(s.clock, Torque(a, t_us, t_us, (0.0, 0.0, 0.0)), s.counts)
+        return True, Stream(s.clock, Torque(a, t_us, t_us, (0.0, 0.0, 0.0)))
     so_far = integrate_torque(s.torque, t_us)
-    return Stream(s.clock, Torque(a, so_far.from_us, so_far.since_us, so_far.total), s.counts)
+    return True, Stream(s.clock, Torque(a, so_far.from_us, so_far.since_us, so_far.total))
 
 
 @kernel
 def lost(s: Stream) -> Stream:
     """The observer has lost itself: the next good sample is a first one again."""
     zero = (0.0, 0.0, 0.0)
-    c = s.clock
-    return Stream(Clock(c.t_us, 0, 0.0, 0, 0.0, 0, 0), Torque(zero, c.t_us, c.t_us, zero), count(s.counts, 7))
+    t_us = s.clock.t_us
+    return Stream(Clock(t_us, 0, 0.0, 0, 0.0, 0, 0), Torque(zero, t_us, t_us, zero))
 
 
 # ---- as arrays: what crosses the border between Python and compiled code, 10 times as fast as nested NamedTuples ----------------
-INTS, FLOATS = 17, 8
+INTS, FLOATS = 17, 8  # the first 10 integers are Counts
 
 
 @kernel
 def pack(s: Stream, ints: np.ndarray, floats: np.ndarray) -> None:
-    """Into the first INTS integers and FLOATS floats of the arrays; the counts come first."""
-    n, c, m = s.counts, s.clock, s.torque
-    ints[0], ints[1], ints[2], ints[3], ints[4] = n.accepted, n.not_finite, n.bad_norm, n.duplicate, n.late
-    ints[5], ints[6], ints[7], ints[8], ints[9] = n.gaps, n.restarts, n.lost, n.bad_torque, n.bad_stamp
+    """Into the arrays, in place; the counts, and what lies behind, are left alone."""
+    c, m = s.clock, s.torque
     ints[10], ints[11], ints[12], ints[13], ints[14] = c.t_us, c.fresh, c.slow, c.late_run, c.late_t_us
     ints[15], ints[16] = m.from_us, m.since_us
     floats[0], floats[1] = c.period_s, c.slow_s
@@ -201,6 +188,5 @@ def pack(s: Stream, ints: np.ndarray, floats: np.ndarray) -> None:
 def unpack(ints: np.ndarray, floats: np.ndarray) -> Stream:
     """What `pack` wrote."""
     i, f = ints, floats
-    counts = Counts(i[0], i[1], i[2], i[3], i[4], i[5], i[6], i[7], i[8], i[9])
     clock = Clock(i[10], i[11], f[0], i[12], f[1], i[13], i[14])
-    return Stream(clock, Torque((f[2], f[3], f[4]), i[15], i[16], (f[5], f[6], f[7])), counts)
+    return Stream(clock, Torque((f[2], f[3], f[4]), i[15], i[16], (f[5], f[6], f[7])))
