@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.integrate import solve_ivp
 
-from mavquad.estimate import gsmo, gsmo_relay, lie, mekf, rate_baselines, torque
-from tools.papers.gsmo_runs import Config, Stimulus
+from mavquad.estimate import gsmo, gsmo_relay, lie, mekf, rate_baselines, rate_filters, torque
+from tools.papers.geometric.runs import Config, Stimulus
 
 Array = npt.NDArray[np.float64]
 INERTIA = (8.942e-3, 9.458e-3, 7.787e-3)
@@ -88,7 +88,7 @@ def stimulus(
     gap_s: tuple[float, float] | None = None,
     period_s: float = PERIOD,
 ) -> Stimulus:
-    """The samples of one run. torque_scale 0: unknown, 1.2: 20 % too large. gap_s: (begin, length) without samples."""
+    """The samples of one run. torque_scale 0: unknown, 1.2: 20 % too large. gap_s: (last sample before, seconds until the next)."""
     rng = np.random.default_rng(seed)
     n = len(source.t)
     every = round(period_s / source.h)
@@ -99,7 +99,7 @@ def stimulus(
     if flips:
         samples = samples * np.where(rng.random(n) < 0.5, -1.0, 1.0)[:, None]
     if gap_s is not None:
-        has &= ~((source.t > gap_s[0] - 1e-9) & (source.t < gap_s[0] + gap_s[1] - 1e-9))
+        has &= ~((source.t > gap_s[0] + 1e-9) & (source.t < gap_s[0] + gap_s[1] - 1e-9))
     return Stimulus(torque_scale * source.a_half, has, samples, source.h, period_s)
 
 
@@ -118,7 +118,7 @@ def implicit(name: str, variant: str, k1: float = 0.0, k2: float = 0.0, L: float
     return Config(name, "implicit", gsmo.fixed_gains(params, GYRO).implicit)
 
 
-def kalman(name: str, bias_walk: float, attitude_noise_deg: float = 0.1, accel_noise: float = 0.3) -> Config:
+def kalman(name: str, accel_noise: float, bias_walk: float, attitude_noise_deg: float = 0.1) -> Config:
     start_bias = 1.0 if bias_walk > 0.0 else 0.0
     gains = mekf.Gains(accel_noise, bias_walk, math.radians(attitude_noise_deg), 3.0, 3.0, start_bias, GYRO)
     return Config(name, "kalman", gains)
@@ -129,7 +129,7 @@ def traditional(name: str, scheme: int, hold: bool) -> Config:
 
 
 def configurations() -> dict[str, Config]:
-    """G1 ... B3 as in the note."""
+    """G1 ... B3 as in the note; the bank without and with the inertia."""
     listed = [
         explicit("G1", "relay", 1, 4.0, 8.0),
         explicit("G2", "relay", 2, 4.0, 8.0),
@@ -145,8 +145,38 @@ def configurations() -> dict[str, Config]:
         traditional("B1b", rate_baselines.EULER, False),
         traditional("B1c", rate_baselines.RK4, False),
         traditional("B1d", rate_baselines.ADDITIVE, True),
-        kalman("B2a", 0.0),
-        kalman("B2b", 0.3),
+        kalman("B2a", 0.3, 0.0),
+        kalman("B2b", 0.0, 0.3),
         Config("B3", "difference", 5.0),
+        Config("online", "online", ZERO),
+        Config("online-J", "online", GYRO),
     ]
     return {c.name: c for c in listed}
+
+
+# ---- figures of merit ------------------------------------------------------------------------------------------------------
+def attitude_error_deg(source: Truth, q_hat: Array) -> Array:
+    """Angle between the true and the observed attitude at every tick [deg]."""
+    relative = multiply(source.q * np.array([1.0, -1.0, -1.0, -1.0]), q_hat)
+    return np.degrees(2.0 * np.arctan2(np.linalg.norm(relative[:, 1:], axis=1), np.abs(relative[:, 0])))
+
+
+def rms(x: Array) -> float:
+    """Over everything given."""
+    return float(np.sqrt(np.mean(np.square(x))))
+
+
+def after(source: Truth, t_s: float) -> npt.NDArray[np.bool_]:
+    """Which ticks are at t_s or later."""
+    return source.t >= t_s - 1e-9
+
+
+def settling_s(source: Truth, w_hat: Array, q_hat: Array) -> float:
+    """Time after which the 5 Hz-filtered rate error stays below 0.2 rad/s and the attitude error below 10 deg; inf: never."""
+    rate_error = np.linalg.norm(rate_filters.low_pass(w_hat - source.w, 5.0, source.h), axis=1)
+    bad = ~(rate_error < 0.2)
+    if np.isfinite(q_hat).all():
+        bad |= ~(attitude_error_deg(source, q_hat) < 10.0)
+    if bad[-1]:
+        return math.inf
+    return float(source.t[np.flatnonzero(bad)[-1] + 1]) if bad.any() else 0.0

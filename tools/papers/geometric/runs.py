@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from mavquad.estimate import gsmo_implicit, gsmo_relay, mekf, rate_baselines, rate_filters
+from mavquad.estimate import gsmo_implicit, gsmo_online, gsmo_relay, mekf, rate_baselines, rate_filters
 from mavquad.jit import kernel
 
 Array = npt.NDArray[np.float64]
@@ -109,6 +109,34 @@ def kalman(gains, stimulus, q0, w0):
 
 
 @kernel
+def online(gyro, stimulus, q0, w0):
+    """The bank: started by its first sample, whatever q0 and w0 are, as it is in flight."""
+    a_half, has, samples, h, _ = stimulus
+    n = len(has)
+    w_out, q_out = np.empty((n, 3)), np.empty((n, 4))
+    bank = gsmo_online.new(_quat(samples, 0))
+    fresh, since, period = 0, 0.0, 0.0
+    for k in range(n):
+        if has[k]:
+            if fresh == 0:
+                gsmo_online.start(bank, _quat(samples, k))
+            else:
+                if fresh == 1:
+                    period = since
+                elif since < 2.5 * period:
+                    period += (since - period) / min(fresh, 50)
+                gsmo_online.correct(bank, _quat(samples, k), since, period, fresh)
+            fresh += 1
+            since = 0.0
+        q, w = gsmo_online.mixed(bank)
+        _store(w_out, q_out, k, w, q)
+        gap_s = -1.0 if period > 0.0 and since > 2.5 * period else math.inf
+        gsmo_online.advance(bank, gyro, _vec(a_half, 2 * k + 1), h, h, gap_s)
+        since += h
+    return w_out, q_out
+
+
+@kernel
 def difference(cutoff_hz, stimulus):
     """The plain difference of the last two samples, held between samples, through a Butterworth at tick rate."""
     _, has, samples, h, _ = stimulus
@@ -126,9 +154,12 @@ def difference(cutoff_hz, stimulus):
     return rate_filters.butterworth_run(rate_filters.butterworth(cutoff_hz, h), d)
 
 
+LOOPS = {"relay": relay, "implicit": implicit, "traditional": traditional, "kalman": kalman, "online": online}
+
+
 class Config(NamedTuple):
     name: str
-    family: str  # relay, implicit, traditional, kalman, difference
+    family: str  # one of LOOPS, or difference
     gains: Any
 
 
@@ -137,6 +168,6 @@ def run(config: Config, stimulus: Stimulus, q0: tuple, w0: tuple) -> tuple[Array
     if config.family == "difference":
         w = difference(config.gains, stimulus)
         return w, np.full((len(w), 4), math.nan)
-    loop = {"relay": relay, "implicit": implicit, "traditional": traditional, "kalman": kalman}[config.family]
+    loop = LOOPS[config.family]
     result: tuple[Array, Array] = loop(config.gains, stimulus, q0, w0)
     return result
