@@ -82,6 +82,8 @@ class Estimate(NamedTuple):
     omega_rad_s: Vec3
     f_ned_m_s2: Vec3  # total disturbance as an acceleration: v' = g e3 - R e3 thrust + f
     tau_rad_s2: Vec3  # rotational disturbance, body
+    delay_s: float = 0.0  # what is commanded now reaches the vehicle this much after t_us; 0 where not measured
+    thrust_m_s2: float = math.nan  # specific thrust thought to act now
 
 
 class Demand(NamedTuple):

@@ -1,0 +1,124 @@
+"""estimate/extended_state_flight.py: what telemetry does to it, sample by sample."""
+
+import math
+
+import numpy as np
+import pytest
+
+from mavquad import airframe, quat
+from mavquad.errors import ConfigError
+from mavquad.estimate import extended_state_flight as flight
+from mavquad.signals import NAN3, ZERO3, Applied, Attitude, Imu, Position, Target
+
+G = 9.80665
+FRAME = airframe.load("x500", ("drag.linear_n_s_m=[0.4,0.4,0.4]", "drag.quadratic_n_s2_m2=[0,0,0]"))
+GAINS = flight.gains(flight.Params(), FRAME)
+
+
+def _fly(gains, seconds, f, *, q=quat.IDENTITY, thrust=G, thrust_true=None, echo=None, bias=ZERO3, spoil=None, delay_s=0.0):
+    """A vehicle under constant thrust, attitude and disturbance (with its drag); returns state, estimate, truth."""
+    state, p, v = flight.init(gains), np.zeros(3), np.zeros(3)
+    estimate = None
+    for ms in range(4, round(1000 * seconds) + 1, 4):
+        true = thrust if thrust_true is None else thrust_true
+        a = np.array([0.0, 0.0, G]) - quat.rotate(q, (0.0, 0.0, true)) + np.array(f) - 0.2 * v
+        p, v = p + 4e-3 * v + 8e-6 * a, v + 4e-3 * a
+        samples = [Attitude(1000 * ms, q, ZERO3)]
+        if ms % 20 == 0:
+            samples.append(Position(1000 * ms, tuple(p), tuple(v + bias)))
+            if echo is not None:
+                samples.append(Target(1000 * ms, q, NAN3, echo, 7))
+        for sample in samples:
+            sample = spoil(sample) if spoil else sample
+            if sample is not None:
+                state = flight.observe(gains, state, sample)
+        state, estimate = flight.step(gains, state, Applied(1000 * ms, q, thrust, NAN3, delay_s), 1000 * ms)
+    return state, estimate, (p, v)
+
+
+def test_a_constant_disturbance_is_found_beside_the_known_drag():
+    q = quat.from_euler(0.1, -0.2, 0.7)
+    f = (0.8, -0.5, 0.3)
+    _, estimate, (p, v) = _fly(GAINS, 6.0, f, q=q, thrust=G / 0.97)
+    np.testing.assert_allclose(estimate.p_ned_m, p, atol=0.02)
+    np.testing.assert_allclose(estimate.v_ned_m_s, v, atol=0.02)
+    np.testing.assert_allclose(estimate.f_ned_m_s2, np.array(f) - 0.2 * v, atol=0.03)  # the total, drag included
+
+
+def test_a_velocity_that_disagrees_with_the_position_leaves_no_offset():
+    _, estimate, (p, _) = _fly(GAINS, 12.0, ZERO3, bias=(0.02, -0.025, 0.0))
+    anchored = np.abs(np.array(estimate.p_ned_m) - p).max()
+    off = flight.gains(flight.Params(anchor_s=0.0), FRAME)
+    _, estimate, (p, _) = _fly(off, 12.0, ZERO3, bias=(0.02, -0.025, 0.0))
+    free = np.abs(np.array(estimate.p_ned_m) - p).max()
+    assert free > 0.004
+    assert anchored < 0.2 * free
+
+
+def test_the_echo_tells_the_thrust_that_acts_whatever_was_sent():
+    """Sent and echoed agree first (that gives the scale); then the echo drops and so does the filter's known thrust."""
+    state, _, _ = _fly(GAINS, 3.0, ZERO3, echo=0.55)
+    assert state.scale == pytest.approx(G / 0.55, rel=1e-6)
+    state = flight.observe(GAINS, state, Target(state.t_us, quat.IDENTITY, NAN3, 0.44, 7))
+    for i in range(1, 60):
+        state = flight.observe(GAINS, state, Attitude(state.t_us + 4000, quat.IDENTITY, ZERO3))
+        if i % 5 == 0:
+            state = flight.observe(GAINS, state, Target(state.t_us, quat.IDENTITY, NAN3, 0.44, 7))
+    assert state.thrust_m_s2 == pytest.approx(0.8 * G, rel=0.06)  # the scale creeps meanwhile
+
+
+def test_without_an_echo_the_thrust_sent_acts_one_delay_later():
+    state = flight.init(GAINS)
+    for ms in range(4, 404, 4):
+        state = flight.observe(GAINS, state, Attitude(1000 * ms, quat.IDENTITY, ZERO3))
+        sent = G if ms <= 200 else 12.0
+        state, _ = flight.step(GAINS, state, Applied(1000 * ms, quat.IDENTITY, sent, NAN3, 0.1), 1000 * ms)
+        if ms <= 300:
+            assert state.thrust_m_s2 == pytest.approx(G, abs=1e-9)
+    assert state.thrust_m_s2 == pytest.approx(12.0, abs=0.15)  # three rotor lags after the change arrived
+
+
+@pytest.mark.parametrize("what", ["nan position", "nan attitude", "twice", "stale", "unknown"])
+def test_bad_samples_change_nothing(what):
+    state, _, _ = _fly(GAINS, 1.0, ZERO3)
+    t = state.t_us
+    bad = {
+        "nan position": Position(t + 1000, (math.nan, 0.0, 0.0), ZERO3),
+        "nan attitude": Attitude(t + 1000, (math.nan, 0.0, 0.0, 0.0), ZERO3),
+        "twice": Attitude(t, quat.IDENTITY, ZERO3),
+        "stale": Position(t - 900_000, (5.0, 5.0, 5.0), ZERO3),
+        "unknown": Imu(t, ZERO3, ZERO3),
+    }[what]
+    assert flight.observe(GAINS, state, bad) == state
+
+
+def test_a_lost_velocity_stream_leaves_a_filter_on_position_alone():
+    def mute(sample):
+        return sample._replace(v_ned_m_s=NAN3) if isinstance(sample, Position) and sample.t_us > 2_000_000 else sample
+
+    state, estimate, (p, v) = _fly(GAINS, 8.0, (0.5, 0.0, 0.0), spoil=mute)
+    np.testing.assert_allclose(estimate.p_ned_m, p, atol=0.05)
+    np.testing.assert_allclose(estimate.v_ned_m_s, v, atol=0.1)
+    assert state.axes[0].r == (GAINS.horizontal.r_first, GAINS.horizontal.r_second)
+
+
+def test_a_negative_thrust_or_a_delay_out_of_range_is_never_believed():
+    state, _, _ = _fly(GAINS, 1.0, ZERO3)
+    before = state.sent
+    state, estimate = flight.step(GAINS, state, Applied(state.t_us, quat.IDENTITY, -5.0, NAN3, 7.0), state.t_us)
+    assert state.sent == before
+    assert estimate.delay_s == 1.0
+    _, estimate = flight.step(GAINS, state, Applied(state.t_us, quat.IDENTITY, G, NAN3, math.nan), state.t_us)
+    assert estimate.delay_s == 1.0
+
+
+def test_before_the_first_position_the_estimate_says_so():
+    state, estimate = flight.step(GAINS, flight.init(GAINS), Applied(0, quat.IDENTITY, G, NAN3, 0.0), 4000)
+    assert math.isnan(estimate.p_ned_m[0])
+    assert state.axes is None
+
+
+@pytest.mark.parametrize("change", [{"adapt": 0.5}, {"anchor_s": 0.05}, {"f_growth": 0.0}, {"drag": -1.0}])
+def test_impossible_parameters_are_refused(change):
+    with pytest.raises(ConfigError, match=r"eskf\."):
+        flight.Params(**change)
