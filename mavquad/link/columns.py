@@ -34,7 +34,7 @@ class Stream(NamedTuple):
     component: int
     msgid: int
     name: str  # "UNKNOWN_437" where the dialect has none
-    count: int
+    messages: int
 
 
 class Layout(NamedTuple):
@@ -72,7 +72,8 @@ class Dialect:
 
 
 def _layout(cls: Any) -> Layout:
-    items, at = {}, scan.STAMP
+    items: dict[str, tuple[Any, int]] = {}
+    at = scan.STAMP
     for name, (count, code) in zip(cls.ordered_fieldnames, _ITEM.findall(cls.unpacker.format), strict=True):
         n = int(count or 1)
         if code in "sc":
@@ -212,14 +213,14 @@ class Log:
 
     def frames(self, start_us: int | None = None, end_us: int | None = None) -> Iterator[tuple[int, Frame]]:
         """(t_us, frame) of all messages of a time span, as `tlog.read` gives them."""
-        return map(self.frame, self.between(start_us, end_us))
+        return (self.frame(int(i)) for i in self.between(start_us, end_us))
 
     def signatures(self, key: bytes) -> NDArray[np.int8]:
         """Per message: 1 signed with this key (32 bytes), -1 signed otherwise, 0 not signed."""
         verdict = np.zeros(len(self), np.int8)
         if self.signed:
             v2 = self._data[self._at] == wire.STX_V2
-            for i in np.flatnonzero(v2 & (self._data[np.minimum(self._at + 2, self.size - 1)] & wire.SIGNED != 0)):
+            for i in map(int, np.flatnonzero(v2 & (self._data[np.minimum(self._at + 2, self.size - 1)] & wire.SIGNED != 0))):
                 raw = self.frame(i)[1].raw
                 verdict[i] = 1 if hashlib.sha256(key + raw[:-6]).digest()[:6] == raw[-6:] else -1
         return verdict

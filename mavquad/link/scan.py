@@ -117,12 +117,12 @@ def find(data, place, crc_extra, keys, slots, key_of, count, t_us, where, stream
     n = 0
     while n < capacity and 2 * count < keys.size:
         start = at + STAMP
+        while start < size and data[start] != STX_V2 and data[start] != STX_V1:
+            start += 1
         if start >= size:
             return n, count, Place(at, sync_at, junk, signed), True
+        at = start - STAMP
         stx = data[start]
-        if stx != STX_V2 and stx != STX_V1:
-            at += 1
-            continue
         length = frame_length(data, start)
         if length == 0:
             at += 1

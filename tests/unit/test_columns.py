@@ -105,7 +105,7 @@ def compare_with_pymavlink(path: Path) -> int:
         other.close()
     for stream, rows in log.everything().items():
         messages = theirs.pop((stream.system, stream.component, stream.msgid))
-        assert len(messages) == stream.count
+        assert len(messages) == stream.messages
         for name in messages[0].get_fieldnames():
             raw = f"_{name}_raw" if hasattr(messages[0], f"_{name}_raw") else name
             bits(rows[name], [getattr(message, raw) for message in messages])
@@ -221,7 +221,7 @@ def test_streams_are_told_apart_by_sender(tmp_path):
     path = tmp_path / "two.tlog"
     path.write_bytes(b"".join(record(i, attitude(i, system=1 + i % 2, seq=i)) for i in range(10)))
     log = columns.Log(path)
-    assert [(s.system, s.component, s.name, s.count) for s in log.streams] == [(1, 1, "ATTITUDE", 5), (2, 1, "ATTITUDE", 5)]
+    assert [(s.system, s.component, s.name, s.messages) for s in log.streams] == [(1, 1, "ATTITUDE", 5), (2, 1, "ATTITUDE", 5)]
     assert log.columns("ATTITUDE", system=2)["t_us"].tolist() == [1, 3, 5, 7, 9]
     with pytest.raises(LogError, match="ATTITUDE comes from 1/1, 2/1: say which"):
         log.columns("ATTITUDE")
@@ -247,7 +247,7 @@ def test_more_streams_than_the_first_table_holds(tmp_path):
     frames = [wire.encode("HEARTBEAT", HEARTBEAT, seq=0, system=s, component=c) for s, c in senders]
     path.write_bytes(b"".join(record(i, raw) for i, raw in enumerate(frames * 2)))
     log = columns.Log(path)
-    assert [(s.system, s.component, s.count) for s in log.streams] == [(s, c, 2) for s, c in senders]
+    assert [(s.system, s.component, s.messages) for s in log.streams] == [(s, c, 2) for s, c in senders]
     assert all(log.rows(s)["t_us"].tolist() == [i, i + 200] for i, s in enumerate(log.streams))
 
 
@@ -275,7 +275,7 @@ def test_signatures_are_verified(of_everything):
 def test_an_unknown_message_is_counted_and_another_dialect_reads_it():
     log = columns.Log(DATA / "flight1-20s.tlog")
     (unknown,) = [s for s in log.streams if s.name == "UNKNOWN_437"]
-    assert unknown.count == 4
+    assert unknown.messages == 4
     with pytest.raises(LogError, match="message id 437 is in no table"):
         log.rows(unknown)
     assert len(columns.Log(DATA / "flight1-20s.tlog", "all").columns("AVAILABLE_MODES_MONITOR")) == 4
