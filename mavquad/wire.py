@@ -48,7 +48,7 @@ class Spec:
         self._extra = bytes([cls.crc_extra])
         self.struct = struct.Struct(cls.unpacker.format)
         self.length = self.struct.size
-        make: Any = namedtuple(cls.msgname, cls.fieldnames)
+        make: Any = namedtuple(cls.msgname, cls.fieldnames)  # type: ignore[misc]
         self.make = make
         wire_names = list(cls.ordered_fieldnames)
         self._order = tuple(wire_names.index(name) for name in cls.fieldnames)  # declared position -> wire position
