@@ -12,13 +12,13 @@ import numpy as np
 
 from mavquad.errors import ConfigError
 from sitl import rotation
+from sitl.config import ORIGIN
 from sitl.params import Table
 from sitl.state import IDLE, OFF, POSITION, RATES
 from sitl.vehicle import Vehicle
 
 TICK_US = 20_000
 EARTH_M = 6_371_000.0
-ORIGIN = (47.397742, 8.545594, 488.0)  # latitude, longitude in degrees, altitude in m of p = (0, 0, 0)
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED, FAILED, IN_PROGRESS = 0, 1, 2, 3, 4, 5  # MAV_RESULT
 EMERGENCY, CRITICAL, ERROR, WARNING, NOTICE, INFO = 0, 2, 3, 4, 5, 6  # MAV_SEVERITY
 ON_GROUND, IN_AIR, TAKING_OFF, LANDING = 1, 2, 3, 4  # MAV_LANDED_STATE

@@ -13,6 +13,8 @@ from mavquad.errors import ConfigError
 
 EPOCH_US = 1_700_000_000_000_000  # log time of simulation time 0
 
+ORIGIN = (47.397742, 8.545594, 488.0)  # latitude, longitude in degrees, altitude in m of the local frame's (0, 0, 0)
+
 
 def _bounds(where: str, value: float, low: float, high: float, unit: str) -> None:
     """Raises ConfigError unless low <= value <= high (and a number)."""

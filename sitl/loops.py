@@ -26,6 +26,7 @@ def run(s, sp, c):
         rest = 0.0 if kind == OFF else c.idle
         for i in range(4):
             s.outputs[i] = rest
+            s.pwm_us[i] = int(1000.5 + 1000.0 * rest)
         _reset(s)
         s.thrust = rest
         return
@@ -150,6 +151,7 @@ def _rates(s, c):
     T = rotors.allocate(c.allocation, 4.0 * full * s.thrust, tau, _YAW_SHARE, c.idle * full, full)
     for i in range(4):
         s.outputs[i] = T[i] / full
+        s.pwm_us[i] = int(1000.5 + 1000.0 * s.outputs[i])
 
 
 @kernel

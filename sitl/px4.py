@@ -8,7 +8,8 @@ from typing import Any
 
 from mavquad.airframe import Airframe
 from sitl import autopilot
-from sitl.autopilot import ACCEPTED, CRITICAL, DENIED, NOTICE, ORIGIN, TEMPORARILY_REJECTED, WARNING, Autopilot
+from sitl.autopilot import ACCEPTED, CRITICAL, DENIED, NOTICE, TEMPORARILY_REJECTED, WARNING, Autopilot
+from sitl.config import ORIGIN
 from sitl.state import ATTITUDE, POSITION, RATES
 
 MANUAL, ALTCTL, POSCTL, AUTO, ACRO, OFFBOARD, STABILIZED = 1, 2, 3, 4, 5, 6, 7

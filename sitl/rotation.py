@@ -179,13 +179,13 @@ def to_quaternion(R):
 
 @kernel
 def towards(force, yaw):
-    """The attitude whose thrust axis (-z) points along `force` (world), its nose as near to `yaw` as that allows."""
+    """The attitude whose thrust axis (-z) points along `force` (world, upwards) and whose nose has the heading `yaw`."""
     n = math.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
     zx, zy, zz = -force[0] / n, -force[1] / n, -force[2] / n
-    # y axis: square to z and to the wanted nose direction
-    cx, cy = math.cos(yaw), math.sin(yaw)
-    yx, yy, yz = -zz * cy, zz * cx, zx * cy - zy * cx
-    k = 1.0 / math.sqrt(yx * yx + yy * yy + yz * yz)
-    yx, yy, yz = k * yx, k * yy, k * yz
-    xx, xy, xz = yy * zz - yz * zy, yz * zx - yx * zz, yx * zy - yy * zx
+    # x axis: square to z and to the horizontal that lies to the right of the heading
+    cy, sy = math.cos(yaw), math.sin(yaw)
+    xx, xy, xz = cy * zz, sy * zz, -sy * zy - cy * zx
+    k = 1.0 / math.sqrt(xx * xx + xy * xy + xz * xz)
+    xx, xy, xz = k * xx, k * xy, k * xz
+    yx, yy, yz = zy * xz - zz * xy, zz * xx - zx * xz, zx * xy - zy * xx
     return (xx, yx, zx, xy, yy, zy, xz, yz, zz)

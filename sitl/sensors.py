@@ -5,6 +5,8 @@ gyro's bias. So its attitude is smooth and already contains the gyro. The motion
 Position and velocity are the truth of `nav_delay` steps ago plus noise that is drawn anew at 50 Hz.
 """
 
+import math
+
 from mavquad.jit import kernel
 from sitl import rotation
 from sitl.plant import GRAVITY_M_S2
@@ -14,6 +16,7 @@ DRIFT_S = 20.0  # correlation time of the AHRS's reference
 RING = 256  # steps remembered for delays
 _PULL_1_S, _LEARN_1_S2 = 0.5, 0.05
 _ACCEL_RANGE_M_S2 = 157.0  # 16 g
+_MAG_N_GAUSS, _MAG_E_GAUSS, _MAG_D_GAUSS = 0.21, 0.013, 0.43
 
 # columns of the block of normals
 GYRO, ACCEL, DRIFT, POSITION, VELOCITY, MOCAP, AIR, COLUMNS = 0, 3, 6, 9, 12, 15, 18, 25
@@ -40,6 +43,12 @@ def sense(s, c, n):
     for i in range(3):
         s.nav_p_ned_m[i] = s.past[then, i] + c.position_bias[i] + s.nav_noise[i]
         s.nav_v_ned_m_s[i] = s.past[then, 3 + i] + c.velocity_bias[i] + s.nav_noise[3 + i]
+    field = apply_t(R, (_MAG_N_GAUSS, _MAG_E_GAUSS, _MAG_D_GAUSS))
+    for i in range(3):
+        s.magnetometer_gauss[i] = field[i]
+    altitude = c.altitude_m - s.nav_p_ned_m[2]
+    s.barometer[0] = 1013.25 * math.exp(5.255 * math.log(1.0 - altitude / 44330.77))  # the standard atmosphere
+    s.barometer[2] = altitude
     if s.step % c.mocap_every == 0:
         _mocap(s, c, n)
 

@@ -126,7 +126,7 @@ class Run:
 
     def __init__(self, sitl: Sitl, lockstep: bool, log: Path | None, landed_s: float | None, max_time_s: float | None) -> None:
         self._writer = tlog.Writer(log) if log else None
-        self.sim = Simulation(sitl, self._writer.write if self._writer else None, lockstep)
+        self.sim = Simulation(sitl, self._writer.write_all if self._writer else None, lockstep)
         self.ports = Ports(self.sim)
         self._landed_us = None if landed_s is None else round(1e6 * landed_s)
         self._max_us = None if max_time_s is None else round(1e6 * max_time_s)
@@ -193,6 +193,7 @@ class Run:
 
     def close(self) -> None:
         """Close sockets and the log."""
+        self.sim.flush()
         self.ports.close()
         if self._writer:
             self._writer.close()

@@ -20,11 +20,12 @@ from sitl.vehicle import Vehicle
 COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 _HEARTBEAT, _TIMESYNC = wire.ID["HEARTBEAT"], wire.ID["TIMESYNC"]
 TRUTH_COMPONENT = 25  # MAV_COMP_ID_USER1: truth has a sequence of its own
-Record = Callable[[int, bytes], None]
+Record = Callable[[list[tuple[int, bytes]]], None]
 
 
 class Simulation:
-    """One vehicle, its autopilot and its links. `record(t_us, raw)` is given every frame and the truth, stamped in vehicle time.
+    """One vehicle, its autopilot and its links. `record([(t_us, raw), ...])` is given, once a control period, every frame
+    and the truth, stamped in vehicle time (from `config.EPOCH_US` on).
 
     With `lockstep` time waits (in the shell) for a companion: its first HEARTBEAT, then an answer to each period's barrier.
     """
@@ -40,7 +41,8 @@ class Simulation:
         self.sick: set[str] = set()  # sensors with a fault
         self.gyro_name = "gyro_rad_s"
         self.mocap_age_us = 1000 * sitl.noise.mocap_delay_ms
-        self._record = record or _nowhere
+        self._record = record
+        self._records: list[tuple[int, bytes]] = []
         self._period_us = 1000 * sitl.period_ms
         self._services = Services(self)
         self.autopilot = self._boot()
@@ -130,19 +132,27 @@ class Simulation:
             self.engaged_periods += 1
             self.misses += self.autopilot.fresh == 0
         self._was_engaged, self.autopilot.fresh = engaged, 0
-        self._write_truth()
+        if self._record is not None:
+            self._write_truth()
+            self.flush()
         if self.lockstep:
             self._barrier_ns = 1000 * self.t_us
 
+    def flush(self) -> None:
+        """Hand over what is not recorded yet."""
+        if self._record is not None and self._records:
+            self._record(self._records)
+            self._records = []
+
     def run_until(self, t_us: int) -> None:
         """Move on to t_us (a whole number of loop periods): plant, arrivals, modes and streams at their instants."""
-        dt_us = self.vehicle.dt_us
-        while self.t_us < t_us:
-            due_us = min(t_us, self._stream_us, self._tick_us, *(link.up.due_us for link in self.links))
-            steps = -(-(due_us - self.t_us) // dt_us)
-            self.vehicle.run(max(1, steps))
-            now_us = self.t_us
-            for link in self.links:
+        vehicle, links_, dt_us = self.vehicle, self.links, self.vehicle.dt_us
+        now_us = vehicle.t_us
+        while now_us < t_us:
+            due_us = min(t_us, self._stream_us, self._tick_us, *[link.up.due_us for link in links_])
+            vehicle.run(max(1, -(-(due_us - now_us) // dt_us)))
+            now_us = vehicle.t_us
+            for link in links_:
                 if link.up.due_us <= now_us:
                     for raw in link.up.take(now_us, _as_it_is):
                         self._arrived(link, raw)
@@ -203,7 +213,8 @@ class Simulation:
         return raw
 
     def _log(self, raw: bytes) -> None:
-        self._record(self.epoch_us + self.t_us, raw)
+        if self._record is not None:
+            self._records.append((self.epoch_us + self.vehicle.t_us, raw))
 
     def _answers(self, frame: Frame) -> bool:
         m = wire.decode(frame)
@@ -261,7 +272,3 @@ class Simulation:
 
 def _as_it_is(raw: bytes) -> bytes:
     return raw
-
-
-def _nowhere(t_us: int, raw: bytes) -> None:
-    """A record that nobody keeps."""

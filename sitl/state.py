@@ -45,6 +45,8 @@ VEHICLE = np.dtype(
         ("nav_noise", "f8", 6),
         ("nav_p_ned_m", "f8", 3),
         ("nav_v_ned_m_s", "f8", 3),
+        ("magnetometer_gauss", "f8", 3),
+        ("barometer", "f8", 3),  # hPa, differential pressure (none), altitude in m
         ("past", "f8", (256, 6)),  # true position and velocity, for the delay of the position
         ("mocap_q_wxyz", "f8", 4),
         ("mocap_p_ned_m", "f8", 3),
@@ -59,6 +61,7 @@ VEHICLE = np.dtype(
         ("thrust", "f8"),  # collective 0..1
         ("force_m_s2", "f8", 3),  # wanted by the position loop
         ("outputs", "f8", 4),  # of each rotor, 0..1 of its full thrust
+        ("pwm_us", "i8", 4),
     ]
 )
 
@@ -116,6 +119,7 @@ CONSTANTS = np.dtype(
         ("drift_draw", "f8"),
         ("position_sigma", "f8"),
         ("velocity_sigma", "f8"),
+        ("altitude_m", "f8"),  # of the local frame's origin
         ("nav_every", "i8"),
         ("nav_delay", "i8"),  # steps
         ("mocap_sigma", "f8"),

@@ -7,7 +7,8 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from sitl.autopilot import ORIGIN, geodetic
+from sitl.autopilot import geodetic
+from sitl.config import ORIGIN
 from sitl.plant import GRAVITY_M_S2
 
 if TYPE_CHECKING:
@@ -15,11 +16,10 @@ if TYPE_CHECKING:
 
 Fields = tuple[Any, ...]
 NAN = math.nan
-_ZEROS_16 = (0,) * 12
+_ZEROS_12 = (0,) * 12
 # gyro, accelerometer, magnetometer, pressure, GPS, rate, attitude, yaw, z, xy control, motors, AHRS, battery, pre-arm check
 _SENSORS = 1 | 2 | 4 | 8 | 32 | 1024 | 2048 | 4096 | 8192 | 16384 | 32768 | 1 << 21 | 1 << 25 | 1 << 28
 _HEALTH = {"gyro": 1, "accel": 2, "imu": 3, "attitude": 1 << 21, "position": 32}
-_MAG_NED_GAUSS = (0.21, 0.013, 0.43)
 _FULL_MV, _EMPTY_MV = 16_800, 13_200
 
 # the order in which messages of one instant leave: the attitude last, since a companion is paced by it
@@ -70,20 +70,18 @@ def builders(sim: "Simulation") -> dict[str, Callable[[], Fields | None]]:
         return boot_us() // 1000
 
     def highres_imu() -> Fields:
-        mag = _body(v.state.view["ahrs_R"].tolist(), _MAG_NED_GAUSS)
-        altitude = ORIGIN[2] - read("nav_p_ned_m")[2]
-        pressure = 1013.25 * (1.0 - altitude / 44330.77) ** 5.255
-        return boot_us(), *read("accel_m_s2"), *read(sim.gyro_name), *mag, pressure, 0.0, altitude, 25.0, 0x1FFF, 0
+        state = v.state.view
+        air = (*state["magnetometer_gauss"].tolist(), *state["barometer"].tolist())
+        return v.t_us - sim.autopilot.boot_us, *read("accel_m_s2"), *read(sim.gyro_name), *air, 25.0, 0x1FFF, 0
 
     def coarse_imu() -> tuple[int, ...]:
         a = [_int16(1000.0 / GRAVITY_M_S2 * x) for x in read("accel_m_s2")]
         g = [_int16(1000.0 * x) for x in read(sim.gyro_name)]
-        m = [_int16(1000.0 * x) for x in _body(v.state.view["ahrs_R"].tolist(), _MAG_NED_GAUSS)]
+        m = [_int16(1000.0 * x) for x in v.state.view["magnetometer_gauss"].tolist()]
         return (*a, *g, *m)
 
     def servo_output_raw() -> Fields:
-        pwm = [int(1000.5 + 1000.0 * u) for u in v.state.view["outputs"].tolist()]
-        return boot_us() & 0xFFFFFFFF, 0, *pwm, *_ZEROS_16
+        return boot_us() & 0xFFFFFFFF, 0, *v.state.view["pwm_us"].tolist(), *_ZEROS_12
 
     def local_position_ned() -> Fields | None:
         if not sim.autopilot.has_origin:

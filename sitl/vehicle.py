@@ -60,6 +60,7 @@ class Vehicle:
     def __init__(self, sitl: config.Sitl) -> None:
         tuned, true = config.vehicles(sitl)
         self.dt_us = 1_000_000 // sitl.loop_hz
+        self.t_us = 0  # vehicle time
         self.constants = Record(CONSTANTS)
         self.setpoint = Record(SETPOINT)
         self.state = Record(VEHICLE)
@@ -72,11 +73,6 @@ class Vehicle:
         self._fill_tuning(sitl, tuned)
         self._stand(sitl)
 
-    @property
-    def t_us(self) -> int:
-        """Vehicle time."""
-        return int(self.state["step"]) * self.dt_us
-
     def quaternion(self) -> tuple[float, ...]:
         """True attitude (w, x, y, z)."""
         return rotation.to_quaternion(tuple(self.state["R"].tolist()))  # type: ignore[no-any-return]
@@ -84,14 +80,16 @@ class Vehicle:
     def run(self, steps: int) -> None:
         """Move on by a number of loop periods."""
         while steps > 0:
-            left = _BLOCK - self.state["step"] % _BLOCK
-            now = min(steps, left)
+            now = min(steps, self._left)
             advance(self.state.array, self.setpoint.array, self.constants.array, self._gusts, self._normals, now)
+            self.t_us += now * self.dt_us
+            self._left -= now
             steps -= now
-            if now == left:
+            if not self._left:
                 self._draw()
 
     def _draw(self) -> None:
+        self._left = _BLOCK
         for generator, (first, last) in zip(self._generators, _GENERATORS, strict=True):
             self._normals[:, first:last] = generator.standard_normal((_BLOCK, last - first))
 
@@ -130,6 +128,7 @@ class Vehicle:
         c["drift_keep"], c["drift_draw"] = keep, math.radians(n.attitude_deg) * math.sqrt(1.0 - keep * keep)
         self.state["drift_rad"] = math.radians(n.attitude_deg) * np.random.default_rng([sitl.seed, 99]).standard_normal(3)
         c["position_sigma"], c["velocity_sigma"] = n.position_m, n.velocity_m_s
+        c["altitude_m"] = config.ORIGIN[2]
         c["nav_every"] = sitl.loop_hz // 50
         delay = n.position_delay_ms if n.position_delay_ms is not None else {"px4": 0, "ardupilot": 20}[sitl.personality]
         c["nav_delay"] = round(1e-3 * delay * sitl.loop_hz)

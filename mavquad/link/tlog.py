@@ -44,7 +44,14 @@ class Writer:
 
     def write(self, t_us: int, raw: bytes) -> None:
         """One frame with its stamp, in one unbuffered write. Raises LogError where the disk takes no more."""
-        record = t_us.to_bytes(STAMP, "big") + raw
+        self._put(t_us, t_us.to_bytes(STAMP, "big") + raw)
+
+    def write_all(self, records: list[tuple[int, bytes]]) -> None:
+        """Many frames in one write, for a program that may lose them together when it is killed. Raises LogError as `write`."""
+        if records:
+            self._put(records[-1][0], b"".join([t_us.to_bytes(STAMP, "big") + raw for t_us, raw in records]))
+
+    def _put(self, t_us: int, record: bytes) -> None:
         try:
             written = os.write(self._fd, record)
             while written < len(record):  # a signal or a nearly full disk: the rest, or the reason
