@@ -68,9 +68,7 @@ class Spec:
         for at, name in enumerate(wire_names):
             i = cls.fieldnames.index(name)
             items.append(f"text(f[{i}])" if i in self._texts else f"*f[{i}]" if cls.lengths[at] > 1 else f"f[{i}]")
-        self._pack: Callable[[tuple[Any, ...]], bytes] = eval(
-            f"lambda f: pack({', '.join(items)})", {"pack": self.struct.pack, "text": _text}
-        )
+        self._pack: Any = eval(f"lambda f: pack({', '.join(items)})", {"pack": self.struct.pack, "text": _text})
 
     def unpack(self, payload: bytes) -> Any:
         """The message from its payload, zero-extended where the sender trimmed it."""
