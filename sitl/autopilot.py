@@ -190,7 +190,7 @@ class Autopilot:
 
     def position(self) -> list[float]:
         """Where the autopilot believes it is, local frame."""
-        return self.vehicle.state["nav_p_ned_m"].tolist()  # type: ignore[no-any-return]
+        return self.vehicle.state["nav_p_ned_m"].tolist()
 
     def yaw(self) -> float:
         """Its heading."""
@@ -308,7 +308,7 @@ def quaternion_matrix(q: Any) -> tuple[float, ...] | None:
     if not 0.995 < norm < 1.005:  # NaN fails too
         return None
     w, x, y, z = (x / norm for x in q)
-    return rotation.from_quaternion((w, x, y, z))  # type: ignore[no-any-return]
+    return rotation.from_quaternion((w, x, y, z))
 
 
 def geodetic(p_ned_m: Any) -> tuple[int, int, float]:

@@ -22,7 +22,7 @@ def _bounds(where: str, value: float, low: float, high: float, unit: str) -> Non
         raise ConfigError(f"{where} = {value}: expected {low:g} to {high:g} {unit}")
 
 
-class Start(config.Section):
+class Start(config.Section, frozen=True):
     """Where the vehicle stands at time 0; north-east of the origin, on the ground unless higher."""
 
     p_ned_m: Vec3 = (0.0, 0.0, 0.0)
@@ -33,7 +33,7 @@ class Start(config.Section):
             raise ConfigError(f"start = {self}: expected finite numbers, p_ned_m[2] <= 0 (not below the ground)")
 
 
-class Gust(config.Section):
+class Gust(config.Section, frozen=True):
     """A discrete gust in vehicle time: 1-cosine rise over a quarter of its duration, full speed, 1-cosine fall."""
 
     t_s: float
@@ -47,7 +47,7 @@ class Gust(config.Section):
         _bounds("wind.gusts.t_s", self.t_s, 0.0, 1e6, "s")
 
 
-class Wind(config.Section):
+class Wind(config.Section, frozen=True):
     """Mean wind (with a height profile: the speed is then the one at 20 ft), Dryden turbulence, gusts, rotor inflow."""
 
     mean_m_s: float = 0.0
@@ -71,7 +71,7 @@ class Wind(config.Section):
             _bounds("wind.turbulence_airspeed_m_s", self.turbulence_airspeed_m_s, 1.0, 100.0, "m/s")
 
 
-class Noise(config.Section):
+class Noise(config.Section, frozen=True):
     """One standard deviation per axis and sample, and constant biases. Position and velocity are white at 50 Hz."""
 
     position_m: float = 0.02
@@ -96,7 +96,7 @@ class Noise(config.Section):
             _bounds(f"noise.{name}", getattr(self, name) or 0, 0, 200, "ms")
 
 
-class Link(config.Section):
+class Link(config.Section, frozen=True):
     """What the wire does to frames, each way, in vehicle time. Probabilities per frame."""
 
     delay_ms: float = 5.0
@@ -118,7 +118,7 @@ class Link(config.Section):
                 raise ConfigError(f"link.silences: [{start}, {stop}]: expected 0 <= from < to, in seconds")
 
 
-class Fault(config.Section):
+class Fault(config.Section, frozen=True):
     """One thing that goes wrong, from t_s for duration_s of vehicle time (0: for good).
 
     kind          sensor                                        value
@@ -158,7 +158,7 @@ class Fault(config.Section):
             )
 
 
-class Sitl(config.Section):
+class Sitl(config.Section, frozen=True):
     """The whole of sitl.toml."""
 
     seed: int = 1

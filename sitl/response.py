@@ -76,9 +76,10 @@ def measure(sitl: config.Sitl, step_deg: float = 10.0) -> Response:
         return second_order(t, *x) - mean
 
     fit = optimize.least_squares(residual, (15.0, 0.8, 0.02), bounds=((1.0, 0.2, 0.0), (100.0, 3.0, 0.2)))
-    times = [float(t[np.argmax(mean >= share)]) for share in (0.1, 0.5, 0.63, 0.9)]
     rms = float(np.sqrt(np.mean(residual(fit.x) ** 2)))
-    return Response(*(float(x) for x in fit.x), *times, float(mean.max() - 1.0), rms)
+    wn, zeta, delay_s = (float(x) for x in fit.x)
+    t10, t50, t63, t90 = (float(t[np.argmax(mean >= share)]) for share in (0.1, 0.5, 0.63, 0.9))
+    return Response(wn, zeta, delay_s, t10, t50, t63, t90, float(mean.max() - 1.0), rms)
 
 
 def main(argv: list[str] | None = None) -> int:

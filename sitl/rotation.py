@@ -83,7 +83,7 @@ def log(R):
     c = 0.5 * (R[0] + R[4] + R[8] - 1.0)
     s = math.sqrt(x * x + y * y + z * z)
     angle = math.atan2(s, c)
-    if c > -0.99:
+    if c > 0.0 or s > 1e-5:
         k = 1.0 if s < 1e-12 else angle / s
         return (k * x, k * y, k * z)
     # near half a turn the axis is read from the symmetric part, its sign from the other

@@ -166,7 +166,7 @@ class Simulation:
     # ---- sensors as they are sent -------------------------------------------------------------------------------------
     def sensor(self, name: str) -> list[float]:
         """A sensor's last value."""
-        return self.vehicle.state.view[name].tolist()  # type: ignore[no-any-return]
+        return self.vehicle.state.view[name].tolist()
 
     def battery(self) -> float:
         """What is left of the battery, 1 to 0."""

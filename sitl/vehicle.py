@@ -75,7 +75,7 @@ class Vehicle:
 
     def quaternion(self) -> tuple[float, ...]:
         """True attitude (w, x, y, z)."""
-        return rotation.to_quaternion(tuple(self.state["R"].tolist()))  # type: ignore[no-any-return]
+        return rotation.to_quaternion(tuple(self.state["R"].tolist()))
 
     def run(self, steps: int) -> None:
         """Move on by a number of loop periods."""
