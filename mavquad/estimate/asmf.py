@@ -128,12 +128,12 @@ def authority(state: State, t_us: int) -> float:
 
 @kernel
 def predict(gains: Gains, state: State, f: np.ndarray, drive: np.ndarray, ticks: float, t_us: int) -> State:
-    """z = F z + drive + w, |w_i| <= ticks b_i: one tick, or the longer step that was. f (n, n), drive (n,).
+    """z = F z + drive + w, |w_i| <= ticks b_i: one tick, or the shorter or longer step that was. f (n, n), drive (n,).
 
     drive holds the inputs as applied (saturated: else saturation is taken for model error) and other known terms.
     """
     x, p = state.x.copy(), state.p.copy()
-    q = gains.q * max(ticks, 1.0) ** 2
+    q = gains.q * ticks**2
     if recent_inflations(state, t_us) > HALF_ABOVE:
         for i in range(q.shape[0]):
             if gains.is_f[i]:

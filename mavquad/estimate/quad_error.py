@@ -27,7 +27,6 @@ G_M_S2 = 9.80665
 N_STATES, N_OUTPUTS = 10, 8
 V, F, ATT, F_ATT = 0, 3, 6, 8  # where each part begins among the states
 Y_ATT, Y_V, Y_F = 0, 2, 5  # outputs, in the order in which strips are taken: attitude, velocity, acceleration
-DELAY_TICKS_MAX = 15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,23 +56,18 @@ class Params:
     bounds: Bounds = Bounds()
     attitude_tau_s: float = 0.133  # of the first-order model: 2 zeta/wn
     thrust_lag_s: float = 0.05
-    delay_s: float = 0.0  # from command to the vehicle; the model acts on the command of that long ago
     tick_s: float = 0.02  # what the bounds b are stated for
     half_axes: tuple[float, float, float, float] = (0.5, 5.0, 0.1, 1.0)  # v, f, attitude, f_attitude of the first set
 
     def __post_init__(self) -> None:
         if not (self.attitude_tau_s > 0.0 and self.thrust_lag_s >= 0.0 and self.tick_s > 0.0):
             raise ConfigError(f"quad_error: attitude_tau_s {self.attitude_tau_s}, tick_s {self.tick_s} must be > 0, lag >= 0")
-        if not 0.0 <= self.delay_s <= DELAY_TICKS_MAX * self.tick_s:
-            limit = DELAY_TICKS_MAX * self.tick_s
-            raise ConfigError(f"quad_error.delay_s = {self.delay_s}: expected 0 to {limit:g} s")
 
 
 class Gains(NamedTuple):
     filter: asmf.Gains
     tau_s: float
     lag_s: float
-    delay_ticks: float  # whole or not: commands are read between the ticks
     tick_s: float
     b_f_m_s2: float
 
@@ -83,7 +77,6 @@ class State(NamedTuple):
     intervals: tuple[interval.State, interval.State, interval.State]
     thrust_m_s2: float  # T_m
     attitude_rad: Vec3  # roll, pitch, yaw last measured
-    commands: np.ndarray  # (DELAY_TICKS_MAX + 2, 3) roll, pitch, specific thrust as applied, newest first
 
 
 class Measured(NamedTuple):
@@ -116,7 +109,6 @@ def gains(params: Params) -> Gains:
         asmf.gains(filter_params, c),
         params.attitude_tau_s,
         params.thrust_lag_s,
-        params.delay_s / params.tick_s,
         params.tick_s,
         b.b_f_m_s2,
     )
@@ -127,9 +119,8 @@ def init(gains: Gains, velocity_ned_m_s: Vec3, attitude_rad: Vec3, thrust_m_s2: 
     x = np.zeros(N_STATES)
     x[V : V + 3] = velocity_ned_m_s
     x[ATT : ATT + 2] = attitude_rad[:2]
-    commands = np.tile([attitude_rad[0], attitude_rad[1], thrust_m_s2], (DELAY_TICKS_MAX + 2, 1))
     unknown = interval.init()
-    return State(asmf.init(gains.filter, x), (unknown, unknown, unknown), thrust_m_s2, attitude_rad, commands)
+    return State(asmf.init(gains.filter, x), (unknown, unknown, unknown), thrust_m_s2, attitude_rad)
 
 
 @kernel
@@ -153,19 +144,6 @@ def transition(tau_s: float, dt_s: float) -> np.ndarray:
         f[ATT + i, F_ATT + i] = tau_s * (1.0 - decay)
         f[F_ATT + i, F_ATT + i] = 1.0
     return f
-
-
-@kernel
-def delayed(commands: np.ndarray, ticks: float) -> Vec3:
-    """(roll, pitch, thrust) as commanded `ticks` before the newest."""
-    whole = int(ticks)
-    part = ticks - whole
-    newer, older = commands[whole], commands[whole + 1]
-    return (
-        (1.0 - part) * newer[0] + part * older[0],
-        (1.0 - part) * newer[1] + part * older[1],
-        (1.0 - part) * newer[2] + part * older[2],
-    )
 
 
 @kernel
@@ -223,14 +201,8 @@ def widening(
 
 
 @kernel
-def step(gains: Gains, state: State, applied: Vec3, measured: Measured, dt_s: float, t_us: int) -> State:
-    """One tick: predict over dt with the command `applied` since the last tick (roll, pitch, thrust), then what arrived."""
-    commands = np.empty_like(state.commands)
-    for i in range(3):
-        commands[0, i] = applied[i]
-        for k in range(1, commands.shape[0]):
-            commands[k, i] = state.commands[k - 1, i]
-    command = delayed(commands, gains.delay_ticks)
+def step(gains: Gains, state: State, command: Vec3, measured: Measured, dt_s: float, t_us: int) -> State:
+    """One tick: predict over dt with the command that acted in it (roll, pitch, specific thrust), then take what arrived."""
     thrust = thrust_after(state.thrust_m_s2, command[2], gains.lag_s, dt_s)
     attitude, rate = state.attitude_rad, (0.0, 0.0, 0.0)
     if linalg.finite3(measured.attitude_rad):
@@ -240,7 +212,7 @@ def step(gains: Gains, state: State, applied: Vec3, measured: Measured, dt_s: fl
     before = nominal_acceleration(state.attitude_rad, state.thrust_m_s2)
     after = nominal_acceleration(attitude, thrust)
     known = drive(gains.tau_s, dt_s, linalg.scale(0.5, linalg.add(before, after)), command)
-    ticks = max(dt_s / gains.tick_s, 1.0)
+    ticks = dt_s / gains.tick_s
     inner = asmf.predict(gains.filter, state.filter, transition(gains.tau_s, dt_s), known, ticks, t_us)
     y = outputs(measured, attitude, thrust)
     a_ned = linalg.add(after, (inner.x[F], inner.x[F + 1], inner.x[F + 2]))
@@ -250,7 +222,7 @@ def step(gains: Gains, state: State, applied: Vec3, measured: Measured, dt_s: fl
     ix = interval.update(interval.predict(ix, b), y[Y_F], e[Y_F] + late[Y_F])
     iy = interval.update(interval.predict(iy, b), y[Y_F + 1], e[Y_F + 1] + late[Y_F + 1])
     iz = interval.update(interval.predict(iz, b), y[Y_F + 2], e[Y_F + 2] + late[Y_F + 2])
-    return State(inner, (ix, iy, iz), thrust, attitude, commands)
+    return State(inner, (ix, iy, iz), thrust, attitude)
 
 
 @kernel

@@ -12,7 +12,7 @@ import numpy as np
 
 from mavquad import linalg, quat
 from mavquad.compensate import active_model
-from mavquad.estimate import quad_error
+from mavquad.estimate import command_line, quad_error
 from mavquad.jit import kernel
 from tools.papers.active import kalman, surroundings
 
@@ -78,7 +78,7 @@ def fly(config: str, case: Case, seed: int) -> Flown:
     hit = rng.uniform(size=n) < case.spikes
     noise[:, 3:6] += np.where(hit[:, None], rng.choice([-2.5, 2.5], (n, 3)), 0.0)
     corner = rng.choice([-1.0, 1.0], (n, 3))
-    gains = quad_error.gains(quad_error.Params(bounds=case.bounds, delay_s=case.model_delay_s))
+    gains = quad_error.gains(quad_error.Params(bounds=case.bounds))
     b, out = case.bounds, np.zeros((n, 22))
     q = np.array([b.b_velocity_m_s] * 3 + [b.b_f_m_s2] * 3 + [b.b_attitude_rad] * 2 + [b.b_f_attitude_rad_s] * 2) ** 2 / 3.0
     state = quad_error.init(gains, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), G_M_S2)
@@ -89,12 +89,13 @@ def fly(config: str, case: Case, seed: int) -> Flown:
         gains,
         active_model.gains(active_model.Params(mode=case.mode), in_flight=False),
         state,
+        command_line.init(np.array([0.0, 0.0, G_M_S2])),
         (case.path.p_m, case.path.v_m_s, case.path.a_m_s2[ahead]),
         air,
         noise,
         corner,
         q,
-        (case.mass_factor, case.delay_s),
+        (case.mass_factor, case.delay_s, case.model_delay_s),
         case.dropout_s,
         case.imu,
         out,
@@ -141,22 +142,20 @@ def _fly(
     gains: quad_error.Gains,
     correction: active_model.Gains,
     state: quad_error.State,
+    sent: command_line.Line,
     path: tuple[np.ndarray, np.ndarray, np.ndarray],
     air: np.ndarray,
     noise: np.ndarray,
     corner: np.ndarray,
     q: np.ndarray,
-    vehicle: tuple[float, float],
+    vehicle: tuple[float, float, float],
     dropout_s: tuple[float, float],
     imu: bool,
     out: np.ndarray,
 ) -> quad_error.State:
-    mass_factor, delay_s = vehicle
+    mass_factor, delay_s, model_delay_s = vehicle
     p_ref, v_ref, a_ref = path
     truth = Truth((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.0, G_M_S2)
-    command = (0.0, 0.0, G_M_S2)
-    line = np.zeros((int(delay_s / DT_S) + 2, 3))  # sent commands, newest first
-    line[:, 2] = G_M_S2
     v_measured = (0.0, 0.0, 0.0)
     integral = (0.0, 0.0, 0.0)
     smooth = (0.0, 0.0, 0.0)  # INDI
@@ -178,12 +177,12 @@ def _fly(
         measured = quad_error.Measured(attitude, velocity, accel, 0.0, 0.0, 0.0)
         # model error
         before = state
-        state = quad_error.step(gains, state, command, measured, DT_S, k * 20_000)
+        acting = _at(sent.value, command_line.index_at(sent, k * 20_000 - 10_000 - round(1e6 * model_delay_s)))
+        state = quad_error.step(gains, state, acting, measured, DT_S, k * 20_000)
         a_before = quad_error.nominal_acceleration(before.attitude_rad, before.thrust_m_s2)
         a_after = quad_error.nominal_acceleration(state.attitude_rad, state.thrust_m_s2)
         a_nominal = linalg.scale(0.5, linalg.add(a_before, a_after))
         y = quad_error.outputs(measured, attitude, state.thrust_m_s2)
-        acting = quad_error.delayed(state.commands, gains.delay_ticks)
         x, p = kalman.predict(
             x, p, quad_error.transition(gains.tau_s, DT_S), quad_error.drive(gains.tau_s, DT_S, a_nominal, acting), q
         )
@@ -217,13 +216,10 @@ def _fly(
             for i in range(3):
                 out[k, 3 + i] = f[i]
         # the vehicle
-        for j in range(3):
-            for i in range(line.shape[0] - 1, 0, -1):
-                line[i, j] = line[i - 1, j]
-            line[0, j] = command[j]
+        sent = command_line.push(sent, k * 20_000, np.array(command))
         for s in range(SUBSTEPS):
-            late = math.ceil((delay_s - s * DT_S / SUBSTEPS) / DT_S - 1e-9)
-            acting = _at(line, max(late, 0))
+            t_us = k * 20_000 + (2 * s + 1) * 10_000 // SUBSTEPS  # the middle of the substep
+            acting = _at(sent.value, command_line.index_at(sent, t_us - round(1e6 * delay_s)))
             truth = _advance(truth, acting, _at(air, SUBSTEPS * k + s), mass_factor, DT_S / SUBSTEPS)
     return state
 
