@@ -1,5 +1,6 @@
 """Airframes: plain numbers of one vehicle, read from `airframes/*.toml`. Each side computes its own mixer from them."""
 
+import math
 from pathlib import Path
 from typing import Literal
 
@@ -50,6 +51,29 @@ class AttitudeResponse(config.Section, frozen=True):
         return 2.0 * self.damping / self.natural_frequency_rad_s
 
 
+class ModelBounds(config.Section, frozen=True):
+    """How wrong this vehicle's telemetry and model are at most: what the set-membership filter's guarantee rests on.
+
+    e: largest error of what is measured. b: largest change per tick that the model does not know. Defaults: the design note of the
+    ASMF, section 8; a vehicle's own come from a flight of it (`mavquad identify --bounds LOG`) and hold quantisation, delay and lag.
+    """
+
+    e_velocity_m_s: float = 0.06
+    e_attitude_rad: float = math.radians(0.3)
+    e_acceleration_m_s2: float = 0.35
+    b_velocity_m_s: float = 0.004
+    b_f_m_s2: float = 0.12
+    b_attitude_rad: float = 0.01
+    b_f_attitude_rad_s: float = 0.05
+    tick_s: float = 0.02
+
+    def __post_init__(self) -> None:
+        for name in self.__struct_fields__:
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ConfigError(f"bounds.{name} = {value}: expected a finite value > 0")
+
+
 class Airframe(config.Section, frozen=True):
     """One vehicle. `hover_thrust` is the collective 0..1 that carries it in still air."""
 
@@ -60,6 +84,7 @@ class Airframe(config.Section, frozen=True):
     kind: Literal["quadrotor", "helicopter"] = "quadrotor"
     rotors: Rotors | None = None
     drag: Drag = Drag()
+    bounds: ModelBounds = ModelBounds()
 
     def __post_init__(self) -> None:
         mass, inertia = self.body.mass_kg, self.body.inertia_kg_m2

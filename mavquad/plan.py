@@ -27,7 +27,7 @@ CONTROLLERS = {
     "iadrc": ("mavquad.control.iadrc_flight", "joint"),
     "eskf-mpc": ("mavquad.control.mpc_flight", "eskf"),
 }
-COMPENSATORS = {"asmf": "mavquad.compensate.active_flight"}
+COMPENSATORS = {"asmf": "mavquad.active_flight"}
 OBSERVERS = {"gsmo": "mavquad.estimate.gsmo"}
 
 

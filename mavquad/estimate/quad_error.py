@@ -11,12 +11,13 @@ The bounds are guaranteed while the stated noise and rate bounds hold; `asmf.Sta
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from mavquad import linalg, quat
+from mavquad.airframe import ModelBounds
 from mavquad.errors import ConfigError
 from mavquad.estimate import asmf, interval
 from mavquad.jit import kernel
@@ -30,38 +31,17 @@ Y_ATT, Y_V, Y_F = 0, 2, 5  # outputs, in the order in which strips are taken: at
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Bounds:
-    """Largest errors e of the outputs and largest changes b of the states per 20 ms; defaults of the design note, section 8.
-
-    A vehicle's own come from its calibration log. Quantisation, delay and motor lag belong inside them.
-    """
-
-    e_velocity_m_s: float = 0.06
-    e_attitude_rad: float = math.radians(0.3)
-    e_acceleration_m_s2: float = 0.35
-    b_velocity_m_s: float = 0.004
-    b_f_m_s2: float = 0.12
-    b_attitude_rad: float = 0.01
-    b_f_attitude_rad_s: float = 0.05
-
-    def __post_init__(self) -> None:
-        for name in self.__slots__:
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ConfigError(f"bounds.{name} = {value}: expected a finite value > 0")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Params:
-    bounds: Bounds = Bounds()
+    bounds: ModelBounds = field(default_factory=ModelBounds)
     attitude_tau_s: float = 0.133  # of the first-order model: 2 zeta/wn
     thrust_lag_s: float = 0.05
-    tick_s: float = 0.02  # what the bounds b are stated for
     half_axes: tuple[float, float, float, float] = (0.5, 5.0, 0.1, 1.0)  # v, f, attitude, f_attitude of the first set
 
     def __post_init__(self) -> None:
-        if not (self.attitude_tau_s > 0.0 and self.thrust_lag_s >= 0.0 and self.tick_s > 0.0):
-            raise ConfigError(f"quad_error: attitude_tau_s {self.attitude_tau_s}, tick_s {self.tick_s} must be > 0, lag >= 0")
+        if not (self.attitude_tau_s > 0.0 and self.thrust_lag_s >= 0.0):
+            raise ConfigError(
+                f"quad_error: attitude_tau_s {self.attitude_tau_s} must be > 0, thrust_lag_s {self.thrust_lag_s} >= 0"
+            )
 
 
 class Gains(NamedTuple):
@@ -109,7 +89,7 @@ def gains(params: Params) -> Gains:
         asmf.gains(filter_params, c),
         params.attitude_tau_s,
         params.thrust_lag_s,
-        params.tick_s,
+        b.tick_s,
         b.b_f_m_s2,
     )
 

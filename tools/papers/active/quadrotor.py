@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mavquad import linalg, quat
+from mavquad.airframe import ModelBounds
 from mavquad.compensate import active_model
 from mavquad.estimate import command_line, quad_error
 from mavquad.jit import kernel
@@ -39,7 +40,7 @@ class Case:
     spikes: float = 0.0  # share of velocity samples that are off by +-2.5 m/s
     dropout_s: tuple[float, float] = (math.inf, math.inf)  # no velocity between these times
     imu: bool = True
-    bounds: quad_error.Bounds = field(default_factory=quad_error.Bounds)
+    bounds: ModelBounds = field(default_factory=ModelBounds)
     mode: str = "centre"
     model_delay_s: float = 0.0
 
@@ -72,7 +73,7 @@ def fly(config: str, case: Case, seed: int) -> Flown:
     n = case.path.p_m.shape[0]
     rng = np.random.default_rng(seed)
     air = surroundings.wind(rng, SUBSTEPS * n + 1, DT_S / SUBSTEPS, gust_m_s=case.gust_m_s)
-    e = quad_error.Bounds()
+    e = ModelBounds()
     size = np.array([e.e_attitude_rad] * 3 + [e.e_velocity_m_s] * 3 + [e.e_acceleration_m_s2] * 3)
     noise = rng.uniform(-1.0, 1.0, (n, 9)) * size
     hit = rng.uniform(size=n) < case.spikes
