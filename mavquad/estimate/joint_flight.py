@@ -179,7 +179,9 @@ def known(model: ekf.EkfModel, q: Quat, thrust_m_s2: float, v: Vec3) -> Vec3:
 
 
 @kernel
-def carry(gains: ekf.EkfGains, state: ekf.EkfState, axes: Axes, thrust_m_s2: float, fast: Vec3, use_filter: bool, dt_s: float):
+def carry(
+    gains: ekf.EkfGains, state: ekf.EkfState, axes: Axes, thrust_m_s2: float, fast: Vec3, use_filter: bool, dt_s: float
+) -> tuple[ekf.EkfState, Axes]:
     """Filter and observers over dt of a constant thrust along the attitude: (filter, observers)."""
     f = (axes.z3[0] + fast[0], axes.z3[1] + fast[1], axes.z3[2] + fast[2])
     v = state.v_ned_m_s if use_filter else axpy(1.0, axes.gained_m_s, axes.z2)
