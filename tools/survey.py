@@ -45,8 +45,8 @@ def streams(log: Log) -> list[dict[str, Any]]:
                 "system": s.system,
                 "component": s.component,
                 "name": s.name,
-                "count": s.count,
-                "rate_hz": (s.count - 1) / span_s if span_s > 0.0 else None,
+                "count": s.messages,
+                "rate_hz": (s.messages - 1) / span_s if span_s > 0.0 else None,
             }
         )
     return rows
@@ -107,7 +107,7 @@ def _attitude_stream(log: Log) -> Stream:
     found = log.find("ATTITUDE_QUATERNION")
     if not found:
         raise LogError(f"{log.path}: no ATTITUDE_QUATERNION in it: no body rates from attitude")
-    return max(found, key=lambda s: (s.component == 1, s.count))
+    return max(found, key=lambda s: (s.component == 1, s.messages))
 
 
 def _span(log: Log, source: Stream, from_s: float | None, to_s: float | None) -> tuple[tuple[float, float], str]:
