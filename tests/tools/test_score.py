@@ -21,7 +21,7 @@ def _flight(error_m=(0.3, 0.0, -0.4), n=2000):
     t = 1e-6 * t_us
     ref = np.column_stack([np.sin(t), 0.5 * t, np.full(n, -5.0)])
     w = np.column_stack([0.1 * t, np.zeros(n), np.ones(n)])
-    rows = np.column_stack([t_us, np.where(t >= 2.0, ENGAGED, 3.0), ref, [*w, 0.01, 0.0, -0.02]])
+    rows = np.column_stack([t_us, np.where(t >= 2.0, ENGAGED, 3.0), ref, w + np.array([0.01, 0.0, -0.02])])
     names = ("t_us", "state", "ref_p_n", "ref_p_e", "ref_p_d", "gsmo w_x", "gsmo w_y", "gsmo w_z")
     true_us = 10_000 * np.arange(round(1.1 * n))
     at = 1e-6 * true_us
