@@ -127,13 +127,13 @@ def welch(
 
 
 def ordinary_coherence(x: np.ndarray, y: np.ndarray, dt_s: float, window_s: float = 10.0) -> tuple[np.ndarray, np.ndarray]:
-    """Eq. (13) for one pair, (N,) each: frequencies (Hz) and coherence from Hann segments of `window_s`, half overlapped."""
+    """Eq. (13) for one pair, (N,) each: frequencies (Hz) and coherence from Hann segments of `window_s`, overlapped by 3/4."""
     count = round(window_s / dt_s)
     if len(x) < 2 * count:
         raise LogError(f"coherence needs two segments of {window_s:g} s, got {len(x) * dt_s:.1f} s")
     from scipy import signal  # half a second to import: only where spectra are wanted
 
-    f_hz, g2 = signal.coherence(x - np.mean(x), y - np.mean(y), fs=1.0 / dt_s, nperseg=count)
+    f_hz, g2 = signal.coherence(x - np.mean(x), y - np.mean(y), fs=1.0 / dt_s, nperseg=count, noverlap=3 * count // 4)
     return f_hz, g2
 
 

@@ -1,0 +1,138 @@
+"""`mavquad identify` on logs made here, on excerpts, and on the whole recording of a real autopilot."""
+
+import json
+
+import numpy as np
+import pytest
+
+from mavquad import airframe, wire
+from mavquad.identify import attitude
+from mavquad.identify.attitude import SecondOrder
+from mavquad.identify.excitation import Sweep, value
+from mavquad.identify.timebase import Held
+from tools import __main__ as program
+from tools import identify_log
+
+TRUTH = SecondOrder(0.98, 11.0, 0.9, 0.03, (0.0,) * 4, 1.0, 40)
+START_US = 1_700_000_000_000_000
+
+
+def quaternion(roll, pitch):
+    cr, sr, cp, sp = np.cos(roll / 2), np.sin(roll / 2), np.cos(pitch / 2), np.sin(pitch / 2)
+    return (float(cr * cp), float(sr * cp), float(cr * sp), float(-sr * sp))
+
+
+def write_log(path, *, attitude_hz=50.0, sent=True, amplitude=0.12, restart=False):
+    """Roll swept for 70 s, then both axes for 30 s; commands leave 2 ms before they arrive, telemetry jitters by 4 ms."""
+    rng = np.random.default_rng(2)
+    t_sent = np.cumsum(rng.uniform(0.015, 0.025, 5250))
+    plan = Sweep(amplitude=amplitude, f_start_hz=0.1, f_end_hz=5.0, duration_s=65.0, quiet_s=2.0)
+    later = (t_sent > 72.0) & (t_sent < 103.0)
+    roll = np.array([value(plan, x) for x in t_sent]) + amplitude * later * np.sin(1.7 * t_sent)
+    pitch = amplitude * later * np.sin(2.3 * t_sent + 1.0)
+    t_att = np.arange(0.5, 104.0, 1.0 / attitude_hz)
+    answer = [attitude.predict(TRUTH, Held(t_sent, u), t_att) for u in (roll, pitch)]
+    entries = []
+    for k, t in enumerate(t_att):
+        boot = int(1000 * t) + (60_000 if not restart or t < 90.0 else -85_000)
+        fields = (boot, float(answer[0][k]), float(answer[1][k]), 0.3, 0.0, 0.0, 0.0)
+        entries.append(
+            (t + 0.002 + rng.exponential(0.004), wire.encode("ATTITUDE", fields, seq=k % 256, system=1, component=1))
+        )
+    if sent:
+        for k, t in enumerate(t_sent):
+            fields = (int(1000 * t), 1, 1, 7, quaternion(roll[k], pitch[k]), 0.0, 0.0, 0.0, 0.4)
+            entries.append((t, wire.encode("SET_ATTITUDE_TARGET", fields, seq=k % 256, system=255, component=190)))
+    entries.sort(key=lambda entry: entry[0])
+    path.write_bytes(b"".join((START_US + int(1e6 * t)).to_bytes(8, "big") + raw for t, raw in entries))
+    return path
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    return write_log(tmp_path_factory.mktemp("identify") / "made.tlog")
+
+
+def test_a_log_with_a_sweep_gives_its_attitude_response_and_an_airframe_that_loads(log, tmp_path, capsys):
+    out, report = tmp_path / "mine.toml", tmp_path / "mine.html"
+    assert program.main(["identify", str(log), "--json", "--out", str(out), "--report", str(report)]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["logs"]
+    roll = next(r for r in found["attitude"] if r["axis"] == "roll")
+    assert roll["input"] == "SET_ATTITUDE_TARGET"
+    assert roll["natural_frequency_rad_s"] == pytest.approx(11.0, rel=0.06)
+    assert roll["damping"] == pytest.approx(0.9, rel=0.06)
+    assert roll["delay_s"] == pytest.approx(0.03, abs=0.006)  # the way of the telemetry is known to some milliseconds
+    assert roll["check"][0]["fit_pct"] > 90.0
+    assert roll["coherence_min_0.2_4_hz"] > 0.95
+    loaded = airframe.load(str(out))
+    assert loaded.name == "mine"
+    assert loaded.attitude.gain == pytest.approx(0.98, abs=0.02)
+    assert "from x500" in out.read_text(encoding="utf-8")
+    assert "coherence" in report.read_text(encoding="utf-8")
+    assert any("mass_kg" in text for text in found["missing"])
+    assert any("HIGHRES_IMU" in text for text in found["missing"])
+
+
+def test_the_text_names_the_input_the_spread_and_what_is_missing(log, capsys):
+    assert program.main(["identify", str(log), "--fit", "3-60", "--check", "75-100"]) == 0
+    shown = capsys.readouterr().out
+    assert "SET_ATTITUDE_TARGET" in shown
+    assert "75-100 s" in shown
+    assert "no ATTITUDE_TARGET in this log" in shown
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sent": False}, "no SET_ATTITUDE_TARGET in this log; record"),
+        ({"attitude_hz": 4.0}, "4.0 Hz; needs 17 Hz"),
+        ({"amplitude": 0.002}, "record a sweep"),
+    ],
+)
+def test_what_a_log_lacks_is_said_with_what_to_record(change, message, tmp_path, capsys):
+    path = write_log(tmp_path / "poor.tlog", **change)
+    assert program.main(["identify", str(path)]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_a_log_without_attitude_and_a_missing_file_are_refused(tmp_path, capsys):
+    path = tmp_path / "empty.tlog"
+    raw = wire.encode("SYSTEM_TIME", (1, 2), seq=0, system=1, component=1)
+    path.write_bytes(START_US.to_bytes(8, "big") + raw)
+    assert program.main(["identify", str(path)]) == 1
+    assert "no ATTITUDE in it (it holds SYSTEM_TIME)" in capsys.readouterr().err
+    assert program.main(["identify", str(tmp_path / "none.tlog")]) == 1
+    assert "no such file" in capsys.readouterr().err
+
+
+def test_a_restart_of_the_vehicle_leaves_its_longest_run(tmp_path):
+    flight = identify_log.read(write_log(tmp_path / "restart.tlog", restart=True))
+    assert flight.attitude.t_s[-1] < 92.0
+    assert "restarted" in flight.notes[0]
+
+
+def test_spans_are_read_or_refused(log, capsys):
+    for wrong in ("200", "9-3", "a-b"):
+        assert program.main(["identify", str(log), "--fit", wrong]) == 1
+        assert "--fit" in capsys.readouterr().err
+
+
+def test_the_real_sweep_meets_its_acceptance(recordings, capsys, tmp_path):
+    """Coherence above 0.95 from 0.2 to 4 Hz, 200-230 s predicted to 90 %, 63 % of a step in 150 to 210 ms."""
+    path = recordings / "arducopter-sitl-sweep-calm.tlog"
+    out = tmp_path / "arducopter.toml"
+    assert program.main(["identify", str(path), "--check", "200-230", "--json", "--out", str(out)]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["logs"]
+    sent = {r["axis"]: r for r in found["attitude"] if r["input"] == "SET_ATTITUDE_TARGET"}
+    for axis in ("roll", "pitch"):
+        assert sent[axis]["coherence_min_0.2_4_hz"] > 0.95
+        assert sent[axis]["check"][0]["fit_pct"] >= 90.0
+        assert 0.150 <= sent[axis]["t63_s"] <= 0.210
+        assert found["gyro_filter"][axis]["cutoff_hz"] == pytest.approx(20.0, abs=1.0)
+    assert found["hover_thrust"]["value"] == pytest.approx(0.3635, abs=0.003)
+    assert airframe.load(str(out)).hover_thrust == pytest.approx(0.3635, abs=0.003)
+
+
+def test_a_real_log_without_commands_says_what_to_record(recordings, capsys):
+    assert program.main(["identify", str(recordings / "arducopter-sitl-flight1.tlog")]) == 1
+    assert "no SET_ATTITUDE_TARGET in this log; record" in capsys.readouterr().err

@@ -1,0 +1,152 @@
+"""mavquad identify: frequency responses, a fitted model with confidence, an airframe file the companion can fly with.
+
+Works from recordings alone, of any autopilot: the attitude response from the commands as sent (SET_ATTITUDE_TARGET) and from what the
+autopilot made of them (ATTITUDE_TARGET; on ArduCopter after its own input shaping: the inner loop only), hover thrust, drag, the gyro's
+own filter, torque per command, noise of every stream, link jitter. What this log cannot tell is said, with what to record.
+
+Example: mavquad identify flight.tlog --out mine.toml --report mine.html
+"""
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+from mavquad import airframe
+from mavquad.errors import ConfigError, LogError
+from tools import airframe_toml, identified, identify_log
+from tools.identified import Identified, Span
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("log", type=Path, nargs="+", help="tlog, ULog or DataFlash log")
+    parser.add_argument("--out", type=Path, metavar="FILE.toml", help="write an airframe file for `fly` and `companion`")
+    parser.add_argument(
+        "--airframe", default="x500", help="gives what no log tells: mass, inertia, rotors (default: %(default)s)"
+    )
+    parser.add_argument("--name", help="of the airframe written (default: that of its file)")
+    parser.add_argument("--bounds", action="store_true", help="also noise and rate bounds for the set-membership filter")
+    parser.add_argument("--fit", metavar="A-B", help="seconds of the log to fit (default: where one axis is swept)")
+    parser.add_argument(
+        "--check", metavar="A-B", help="seconds of the log to predict (default: moving parts that are not fitted)"
+    )
+    parser.add_argument("--report", type=Path, metavar="FILE", help="write a self-contained HTML page")
+    parser.add_argument("--json", action="store_true", help="everything, for machines, on stdout")
+
+
+def run(args: argparse.Namespace) -> int:
+    if args.out and len(args.log) > 1:
+        raise ConfigError(f"--out takes one log, got {len(args.log)}; an airframe file comes from one flight")
+    fit_s, check_s = span(args.fit, "--fit"), span(args.check, "--check")
+    base = airframe.load(args.airframe)
+    everything, problems = [], []
+    for path in args.log:
+        print(f"reading {path}", file=sys.stderr, flush=True)
+        found = identified.identify(identify_log.read(path), fit_s, check_s)
+        everything.append(found)
+        if not found.of("SET_ATTITUDE_TARGET"):
+            reasons = [m for m in found.missing if "SET_ATTITUDE_TARGET" in m]
+            problems.append(f"{path}: no response from commands as sent: {reasons[0] if reasons else 'nothing was commanded'}")
+    if args.json:
+        json.dump({"logs": [_plain(identified.summary(found)) for found in everything]}, sys.stdout, allow_nan=False)
+        print()
+    else:
+        print("\n\n".join(text(found) for found in everything))
+    if args.report:
+        from tools import identify_page
+
+        args.report.write_text(identify_page.page_of(everything), encoding="utf-8")
+        print(f"report: {args.report}", file=sys.stderr)
+    if problems:
+        raise LogError(problems[0])
+    if args.out:
+        name = args.name or args.out.stem
+        airframe_toml.write(args.out, airframe_toml.written(everything[0], base, args.airframe, name))
+        print(f"airframe: {args.out} (mass, inertia and rotors from {args.airframe})", file=sys.stderr)
+    return 0
+
+
+def span(text: str | None, option: str) -> Span | None:
+    """`200-230` -> (200.0, 230.0). Raises ConfigError."""
+    if text is None:
+        return None
+    first, _, last = text.partition("-")
+    try:
+        found = float(first), float(last)
+    except ValueError:
+        raise ConfigError(f"{option} {text!r}: expected two times in seconds of the log, like 200-230") from None
+    if not found[1] > found[0] >= 0.0:
+        raise ConfigError(f"{option} {text!r}: the second time must be after the first")
+    return found
+
+
+def text(found: Identified) -> str:
+    """One log's findings for a terminal."""
+    flight = found.flight
+    air = ", ".join(f"{a:.0f}-{b:.0f} s" for a, b in flight.flying) or "never"
+    lines = [f"{flight.path}: {flight.messages} messages, {flight.length_s:.0f} s, in the air {air}", ""]
+    if found.responses:
+        lines.append(
+            "attitude response          gain         wn rad/s      zeta         delay ms    63 %   coherence  chi2  predicts"
+        )
+    for r in found.responses:
+        m = r.found.model
+        checks = " ".join(f"{c.fit_pct:.0f} % at {c.span_s[0]:.0f}-{c.span_s[1]:.0f} s" for c in r.checks) or "nothing left"
+        lines.append(
+            f"{r.axis:5} {r.source:20} {_pm(m.gain, m.sd[0], 3):12} {_pm(m.omega_n_rad_s, m.sd[1], 1):13} {_pm(m.zeta, m.sd[2], 2):12}"
+            f" {_pm(1e3 * m.delay_s, 1e3 * m.sd[3], 0):9} {1e3 * r.t63_s:5.0f} ms {r.coherence_min:8.3f} {m.chi2:6.1f}  {checks}"
+        )
+    if found.responses:
+        lines += ["  (+- is 2 sigma; coherence: the least from 0.2 to 4 Hz; ATTITUDE_TARGET shows the inner loop only)", ""]
+    if found.thrust:
+        t = found.thrust
+        divides = "; it divides thrust by cos(tilt) itself" if t.over_cosine else ""
+        lines.append(
+            f"hover thrust      {_pm(t.hover.value, t.hover.sd, 4)}; thrust gain {_pm(t.gain_m_s2.value, t.gain_m_s2.sd, 2)} m/s^2{divides}"
+        )
+    if found.drag:
+        d = found.drag
+        for i, axis in enumerate(("forward", "right")):
+            a, b = d.linear_1_s[i], d.quadratic_1_m[i]
+            lines.append(
+                f"drag, {axis:8}    ({_pm(a.value, a.sd, 3)} 1/s + {_pm(b.value, b.sd, 4)} |v| 1/m) v, up to {d.fastest_m_s:.1f} m/s"
+            )
+    for axis, g in found.gyro.items():
+        lines.append(
+            f"gyro filter {axis:5} {_pm(g.cutoff_hz.value, g.cutoff_hz.sd, 1)} Hz, two poles: rates are {1e3 * g.lag_s:.1f} ms late"
+        )
+    for axis, q in found.torque.items():
+        signs = "".join("+" if p > 0 else "-" if p < 0 else "0" for p in q.pattern)
+        lines.append(
+            f"torque/inertia {axis:5} {_pm(q.gain_rad_s2.value, q.gain_rad_s2.sd, 0)} rad/s^2 per full command, motors {signs}"
+        )
+    if flight.clock.jitter_s.size:
+        late = sorted(flight.clock.jitter_s)
+        lines.append(
+            f"link              clock drift {flight.clock.drift_ppm:.0f} ppm, messages late by {1e3 * late[len(late) // 2]:.1f} ms"
+            f" (median), {1e3 * late[int(0.99 * len(late))]:.1f} ms (99 %)"
+        )
+    if found.noise:
+        lines += ["", "noise (1 sigma): white, with the slow part"]
+        lines += [f"  {name:28} {n.white:.2g}  {n.slow:.2g}" for name, n in found.noise.items()]
+    lines += ["", "not from this log:"] + [f"  {m}" for m in found.missing]
+    if found.notes:
+        lines += ["", "notes:"] + [f"  {n}" for n in found.notes]
+    return "\n".join(lines)
+
+
+def _pm(value: float, sd: float, digits: int) -> str:
+    return f"{value:.{digits}f}+-{2.0 * sd:.{digits}f}" if math.isfinite(sd) else f"{value:.{digits}f}+-?"
+
+
+def _plain(value: Any) -> Any:
+    """JSON knows no infinity: what is not told is null."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
