@@ -203,6 +203,10 @@ class Log:
         """Numbers of all messages with a stamp in [start_us, end_us), in the order of the file."""
         return np.flatnonzero(_within(self.t_us, start_us, end_us))
 
+    def position(self, number: int) -> int:
+        """The byte of the file where the record of a message begins."""
+        return int(self._at[number]) - scan.STAMP
+
     def frame(self, number: int) -> tuple[int, Frame]:
         """(t_us, frame) of any message by its number in the file."""
         start = int(self._at[number])
