@@ -4,6 +4,8 @@ Every accepted frame is logged before it is acted on, every sent frame before it
 all frames of a period carry its stamp (architecture, section 3).
 """
 
+import bisect
+import itertools
 import json
 import math
 import os
@@ -294,6 +296,7 @@ class Companion:
         """What happened, for `fly` and for people."""
         life = self.flight.life
         latency = sorted(self.latency_us) or [math.nan]
+        edges = [10.0 ** (1.0 + k / 8.0) for k in range(33)]  # 10 us to 0.1 s
         target = self.sources.get(life.target)
         return {
             "state": life.state,
@@ -312,6 +315,10 @@ class Companion:
                 "p50": latency[len(latency) // 2],
                 "p99": latency[min(len(latency) - 1, int(0.99 * len(latency)))],
                 "max": latency[-1],
+            },
+            "latency_histogram": {
+                "edges_us": edges,
+                "counts": [bisect.bisect(latency, b) - bisect.bisect(latency, a) for a, b in itertools.pairwise(edges)],
             },
             "pid": os.getpid(),
         }

@@ -62,7 +62,8 @@ def feed(plan: Plan, flight: Flight, arrival_us: int, frame: Frame) -> Flight:
         _count(f, "unknown message")
     elif (frame.system, frame.component) == f.life.target:
         _sample(plan, f, str(name), wire.decode(frame))
-    f.due_us = _next_due_us(f)
+    if f.life is not flight.life:
+        f.due_us = _next_due_us(f)
     return f
 
 
@@ -348,12 +349,13 @@ def _sample(plan: Plan, f: Flight, name: str, m: Any) -> None:
     elif t_us <= f.stamps.get(name, -1):
         _count(f, f"{name} late or twice")
         return
-    stamps = dict(f.stamps)
+    f.stamps = stamps = dict(f.stamps)
     stamps[name], stamps[f"{name} arrived"] = t_us, f.arrival_us
     if t_us > f.now_us:
         f.now_us = t_us
         stamps["arrival of newest"] = f.arrival_us
-    f.stamps = stamps
+    if name == "ATTITUDE" and f.arrival_us - stamps.get("ATTITUDE_QUATERNION arrived", -(1 << 62)) < 500_000:
+        return  # the quaternion says the same, more often and without angles
     if isinstance(sample, Position):
         sample = _continuous(plan, f, sample)
     elif isinstance(sample, Target):
@@ -367,22 +369,20 @@ def _sample(plan: Plan, f: Flight, name: str, m: Any) -> None:
         f.observers = tuple(
             s.module.observe(s.gains, state, sample) for s, state in zip(plan.observers, f.observers, strict=True)
         )
-    if isinstance(sample, Attitude) and _paces(f, name):
+    if isinstance(sample, Attitude):
+        _pace(f)
         _punctual(plan, f, t_us)
         gap_us = t_us - f.control_us
         if not f.control_us or gap_us >= plan.control_us - f.control_gap_us // 2:
             _control(plan, f, t_us, min(0.2, 1e-6 * gap_us) if f.control_us else 1e-6 * plan.control_us)
 
 
-def _paces(f: Flight, name: str) -> bool:
-    """ATTITUDE_QUATERNION paces the control; ATTITUDE only where it is alone."""
-    if name == "ATTITUDE" and f.arrival_us - f.stamps.get("ATTITUDE_QUATERNION arrived", -(1 << 62)) < 500_000:
-        return False
+def _pace(f: Flight) -> None:
+    """The period of the stream that paces the control."""
     gap = f.now_us - f.stamps.get("pace", f.now_us)
     f.stamps["pace"] = f.now_us
     if 0 < gap < 200_000:
         f.control_gap_us = gap if not f.control_gap_us else min(gap, f.control_gap_us)
-    return True
 
 
 def _punctual(plan: Plan, f: Flight, t_us: int) -> None:

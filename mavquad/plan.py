@@ -17,13 +17,14 @@ from mavquad.settings import Companion
 ESTIMATORS = {
     "direct": "mavquad.estimate.direct",
     "joint": "mavquad.estimate.joint_flight",
+    "leso": "mavquad.estimate.leso_flight",
     "eskf": "mavquad.estimate.extended_state_flight",
 }
 CONTROLLERS = {
     "pd": ("mavquad.control.pd", "direct"),
     "pid": ("mavquad.control.pid", "direct"),
     "autopilot": ("mavquad.control.pid", "direct"),  # flown by the autopilot's own loop; ours only stands by
-    "adrc": ("mavquad.control.adrc_flight", "direct"),
+    "adrc": ("mavquad.control.adrc_flight", "leso"),
     "iadrc": ("mavquad.control.iadrc_flight", "joint"),
     "eskf-mpc": ("mavquad.control.mpc_flight", "eskf"),
 }

@@ -81,6 +81,8 @@ class Ports:
             for address, link in port.links.items():
                 for data in self._sim.collect(link):
                     self._out(port.socket, data, address)
+                    for copy, to in self._copies:
+                        self._out(copy, data, to)
 
     def close(self) -> None:
         """Close every socket."""

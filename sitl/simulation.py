@@ -84,17 +84,13 @@ class Simulation:
         frames, refused, rest = wire.split(data)
         link.refused += refused + len(rest)
         for frame in frames:
+            if self.lockstep and self.periods <= 1 and self._is_start(link, frame):
+                continue
             if frame.msgid == _TIMESYNC and link is self.partner and self._answers(frame):
                 answered = True
-            elif self.lockstep and self.periods <= 1 and self._is_start(link, frame):
-                continue
             else:
                 link.up.put(self.t_us, frame.raw)
             self._log(frame.raw)
-        if answered and self._first_heartbeat is not None:
-            link.up.put(self.t_us, self._first_heartbeat)
-            self._log(self._first_heartbeat)
-            self._first_heartbeat = None
         return answered
 
     def collect(self, link: Link) -> list[bytes]:
@@ -228,9 +224,15 @@ class Simulation:
             return True
         if self.periods == 0:
             return True
-        if link is self.partner and frame.msgid == _HEARTBEAT and frame.component == COMPANION:
+        if link is not self.partner:
+            return False
+        if frame.msgid == _HEARTBEAT and frame.component == COMPANION:
             self._first_heartbeat = frame.raw
             return True
+        if self._first_heartbeat is not None:
+            link.up.put(self.t_us, self._first_heartbeat)
+            self._log(self._first_heartbeat)
+            self._first_heartbeat = None
         return False
 
     def _arrived(self, link: Link, raw: bytes) -> None:

@@ -48,24 +48,48 @@ class Verdict(NamedTuple):
     parting: Parting | None
 
 
+class _Feeder:
+    """The pipeline with its state, as the companion's shell runs it."""
+
+    def __init__(self, plan: Any) -> None:
+        self.plan, self.flight = plan, pipeline.start(plan)
+
+    def feed(self, t_us: int, frame: Frame) -> tuple[list[tuple[int, bytes]], list[tuple[float, ...]]]:
+        """What is sent and the new rows of the trace, after one received frame."""
+        return self._take(pipeline.feed(self.plan, self.flight, t_us, frame))
+
+    def advance(self, t_us: int) -> tuple[list[tuple[int, bytes]], list[tuple[float, ...]]]:
+        """The same when only time passes."""
+        return self._take(pipeline.advance(self.plan, self.flight, t_us))
+
+    def _take(self, after: Any) -> tuple[list[tuple[int, bytes]], list[tuple[float, ...]]]:
+        if after is self.flight:
+            return [], []
+        self.flight = after
+        sent, rows = after.outbox, after.trace
+        after.outbox, after.trace = [], []
+        return sent, rows
+
+
 def play(plan: Any, records: Iterable[Record], *, own: tuple[int, int]) -> Played:
     """Feed every frame that is not our own. Refused ones are counted by reason."""
-    flight, rows = pipeline.start(plan), array("d")
+    feeder, values, names = _Feeder(plan), array("d"), plan.trace_names
     refused: dict[str, int] = {}
     received = sent = 0
     for t_us, frame in records:
         if (frame.system, frame.component) == own:
             continue
-        why = pipeline.accepts(plan, flight, frame)
+        why = pipeline.accepts(plan, feeder.flight, frame)
         if why:
             refused[why] = refused.get(why, 0) + 1
             continue
-        flight = pipeline.feed(plan, flight, t_us, frame)
+        out, rows = feeder.feed(t_us, frame)
         received += 1
-        sent += len(flight.outbox)
-        for row in flight.trace:
-            rows.extend(row)
-    return Played(_trace(plan, rows), flight, received, sent, refused)
+        sent += len(out)
+        for row in rows:
+            values.extend(row)
+    trace = Trace(names, np.frombuffer(values, np.float64).reshape(-1, len(names)) if values else np.empty((0, len(names))))
+    return Played(trace, feeder.flight, received, sent, refused)
 
 
 def verify(
@@ -76,35 +100,30 @@ def verify(
     A log that ends between a frame and its answers is whole, and so is a trace that ends before its log (a killed companion).
     Not `exact` (another processor, other versions): a field may differ in the last bit of a float32, a trace value by CLOSE.
     """
-    if then is not None and then.names != tuple(plan.trace_names):
+    if then is not None and then.names != plan.trace_names:
         different = sorted(set(then.names) ^ set(plan.trace_names))
         return Verdict(0, 0, 0, 0, math.inf, Parting(0, "trace", f"other columns than this version's: {', '.join(different)}"))
-    flight = pipeline.start(plan)
+    feeder = _Feeder(plan)
     again: deque[tuple[int, bytes]] = deque()
-    received = sent = rows = 0
+    received = sent = number = 0
     largest = 0.0
 
     def verdict(parting: Parting | None) -> Verdict:
-        return Verdict(received, sent, len(again), rows, largest, parting)
+        return Verdict(received, sent, len(again), number, largest, parting)
 
     for t_us, frame in records:
         ours = (frame.system, frame.component) == own
         if not ours and again and again[0][0] < t_us:
             return verdict(_surplus(again))
-        if not ours:
-            flight = pipeline.feed(plan, flight, t_us, frame)
-            received += 1
-        elif not again:
-            flight = pipeline.advance(plan, flight, t_us)
-        else:
-            flight = flight.clone()  # its outbox is taken already
-        again.extend(flight.outbox)
-        for row in flight.trace:
-            why = _row_differs(then, rows, row, exact) if then is not None and rows < len(then.rows) else ""
+        out, rows = feeder.feed(t_us, frame) if not ours else ([], []) if again else feeder.advance(t_us)
+        again.extend(out)
+        for row in rows:
+            why = _row_differs(then, number, row, exact) if then is not None and number < len(then.rows) else ""
             if why:
                 return verdict(Parting(t_us, f"trace, at {_name(frame.raw)}", why))
-            rows += 1
+            number += 1
         if not ours:
+            received += 1
             if again and again[0][0] < t_us:  # of a timer due before this frame, which the log lacks
                 return verdict(_surplus(again))
             continue
@@ -117,9 +136,9 @@ def verify(
             largest = max(largest, difference)
             if exact or not difference <= WIRE_CLOSE:
                 return verdict(Parting(t_us, _name(frame.raw), why))
-    if then is not None and rows < len(then.rows):
-        why = f"{len(then.rows)} rows in flight, {rows} in the replay of the whole log"
-        return verdict(Parting(int(then.rows[rows, 0]), "trace", why))
+    if then is not None and number < len(then.rows):
+        why = f"{len(then.rows)} rows in flight, {number} in the replay of the whole log"
+        return verdict(Parting(int(then.rows[number, 0]), "trace", why))
     return verdict(None)
 
 
@@ -138,11 +157,6 @@ def _row_differs(then: Trace, number: int, row: tuple[float, ...], exact: bool) 
         if not same and (exact or not close):
             return f"{name} is {a!r} in flight, {b!r} in the replay (row {number}, vehicle time {int(then.rows[number, 0])} us)"
     return ""
-
-
-def _trace(plan: Any, rows: "array[float]") -> Trace:
-    names = tuple(plan.trace_names)
-    return Trace(names, np.frombuffer(rows, np.float64).reshape(-1, len(names)).copy() if rows else np.empty((0, len(names))))
 
 
 def _message(raw: bytes) -> Any:

@@ -1,18 +1,23 @@
 """Scenarios: what to fly, in what conditions, and what counts as well flown; resolved into both programs' configurations.
 
-A scenario is a TOML file of `scenario/` (or a user's own) laid over `scenario/_standard.toml`, then changed by `--set`:
+A scenario is a TOML file of `scenario/` (or a user's own) over the standard conditions, which are the defaults of the simulated
+autopilot's own types; then changed by `--set`:
   vehicle.mass=+20%          the true vehicle against its file (mass, inertia, drag, thrust, motor_lag, or any key of the file)
-  wind.mean_m_s=5            also noise, link, start, params, path, flight, require: keys of the scenario
-  pid.kp=1.2, limits.x=...   any other table belongs to the companion
+  wind.mean_m_s=5            also noise, link, start, params, path, flight, require: tables of the scenario
+  limits.tilt_deg=30        also safety: tables of the companion; companion.control_hz=250: its own keys
+  pid.ki=0.4                 any other table tunes the stage of that name
 """
 
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from msgspec import field
+import msgspec
 
 from mavquad import airframe, config
 from mavquad.errors import ConfigError
+from mavquad.paths import Path as FlightPath
+from mavquad.settings import Companion
+from sitl.config import Fault, Link, Noise, Sitl, Start, Wind
 
 FOLDER = Path(__file__).resolve().parent / "scenario"
 VEHICLE = {  # short names of what a vehicle can differ in from its file
@@ -22,18 +27,17 @@ VEHICLE = {  # short names of what a vehicle can differ in from its file
     "thrust": "rotors.thrust_max_n",
     "motor_lag": "rotors.lag_s",
 }
+COMPANION_TABLES = ("limits", "safety")
 
 
 class Flight(config.Section, frozen=True):
     """How far the flight goes and from when it is scored."""
 
-    takeoff_m: float
-    score_from_s: float
-    max_time_s: float
+    takeoff_m: float = 5.0
+    score_from_s: float = 3.0  # after the engagement
+    max_time_s: float = 240.0  # vehicle time after which the flight is given up
 
     def __post_init__(self) -> None:
-        if not 0.5 <= self.takeoff_m <= 500.0:
-            raise ConfigError(f"flight.takeoff_m = {self.takeoff_m}: expected 0.5 to 500 m")
         if self.score_from_s < 0.0 or self.max_time_s <= 0.0:
             raise ConfigError(
                 f"flight.score_from_s = {self.score_from_s}, flight.max_time_s = {self.max_time_s}: expected >= 0 and > 0"
@@ -41,28 +45,28 @@ class Flight(config.Section, frozen=True):
 
 
 class Require(config.Section, frozen=True):
-    """What the flight must reach to be `ok`, beside landing without a miss."""
+    """What the flight must reach to be `ok`, beside landing. None: nothing."""
 
     rmse_m: float | None = None
     max_error_m: float | None = None
-    misses: int = 0
+    misses: int | None = 0  # in lockstep; at a speed they depend on what else the machine does
 
 
 class Scenario(config.Section, frozen=True):
-    """One scenario. The tables of the simulated autopilot and of the companion are checked by their own types."""
+    """One scenario."""
 
     about: str
-    path: dict[str, Any]
-    flight: Flight
-    start: dict[str, Any]
-    wind: dict[str, Any]
-    noise: dict[str, Any]
-    link: dict[str, Any]
+    path: FlightPath
+    flight: Flight = Flight()
     require: Require = Require()
-    vehicle: dict[str, str | float | list[float]] = field(default_factory=dict)
-    params: dict[str, float] = field(default_factory=dict)
-    faults: list[dict[str, Any]] = field(default_factory=list)
-    companion: dict[str, Any] = field(default_factory=dict)
+    vehicle: dict[str, str | float | list[float]] = msgspec.field(default_factory=dict)
+    start: Start = Start()
+    wind: Wind = Wind()
+    noise: Noise = Noise()
+    link: Link = Link()
+    faults: list[Fault] = msgspec.field(default_factory=list)
+    params: dict[str, float] = msgspec.field(default_factory=dict)
+    companion: dict[str, Any] = msgspec.field(default_factory=dict)  # over the companion's defaults
 
 
 class Options(config.Section, frozen=True):
@@ -80,16 +84,16 @@ class Options(config.Section, frozen=True):
 
 
 class Resolved(NamedTuple):
-    """What `fly` writes into the run folder: the scenario, and a configuration for each program."""
+    """A scenario as the configurations of both programs."""
 
     scenario: Scenario
-    sitl: dict[str, Any]
-    companion: dict[str, Any]
+    sitl: Sitl
+    companion: Companion
 
 
 def names() -> list[str]:
     """The scenarios that come with mavquad."""
-    return sorted(p.stem for p in FOLDER.glob("[!_]*.toml"))
+    return sorted(p.stem for p in FOLDER.glob("*.toml"))
 
 
 def load(name_or_path: str, changes: list[str] | None = None) -> Scenario:
@@ -101,41 +105,41 @@ def load(name_or_path: str, changes: list[str] | None = None) -> Scenario:
             raise ConfigError(
                 f"no scenario is called {name_or_path!r}; known: {', '.join(names())}; or give a path that ends in .toml"
             )
-    data = _over(config.read(FOLDER / "_standard.toml"), config.read(path))
+    standard = msgspec.to_builtins(Scenario(about="", path=FlightPath()))
+    data = _over({**standard, "companion": _companion_tables()}, config.read(path))
     for change in changes or []:
         data = _set(data, change)
     return config.convert(data, Scenario, str(path))
 
 
 def resolve(scenario: Scenario, options: Options) -> Resolved:
-    """Both programs' configurations as plain tables (see `sitl/config.py` and the companion's). Raises ConfigError."""
+    """Both programs' configurations. Raises ConfigError."""
     overrides = [f"{VEHICLE.get(key, key)}={_text(change)}" for key, change in scenario.vehicle.items()]
     airframe.load(options.airframe, tuple(overrides))
-    sitl = {
-        "seed": options.seed,
-        "personality": options.personality,
-        "airframe": options.airframe,
-        "overrides": overrides,
-        "attitude_source": options.attitude,
-        "start": scenario.start,
-        "wind": scenario.wind,
-        "noise": scenario.noise,
-        "link": scenario.link,
-        "faults": scenario.faults,
-        "params": scenario.params,
-    }
-    chosen = {
-        "airframe": options.airframe,
-        "controller": options.controller,
-        "estimator": options.estimator,
-        "compensator": options.compensator,
-        "observers": options.observers,
-        "loop": options.loop,
-        "takeoff_m": scenario.flight.takeoff_m,
-        "path": scenario.path,
-    }
-    companion = _over({k: v for k, v in chosen.items() if v is not None}, scenario.companion)
-    return Resolved(scenario, sitl, companion)
+    sitl = Sitl(
+        seed=options.seed,
+        personality=options.personality,
+        airframe=options.airframe,
+        overrides=overrides,
+        attitude_source=options.attitude,
+        start=scenario.start,
+        wind=scenario.wind,
+        noise=scenario.noise,
+        link=scenario.link,
+        faults=scenario.faults,
+        params=scenario.params,
+    )
+    chosen = {name: getattr(options, name) for name in ("controller", "estimator", "compensator", "observers", "loop")}
+    companion = _over(
+        {
+            "airframe": options.airframe,
+            "takeoff_m": scenario.flight.takeoff_m,
+            "seed": options.seed,
+            "path": msgspec.to_builtins(scenario.path),
+        },
+        {**scenario.companion, **{name: value for name, value in chosen.items() if value is not None}},
+    )
+    return Resolved(scenario, sitl, config.convert(companion, Companion, "the companion's configuration"))
 
 
 def _set(data: dict[str, Any], change: str) -> dict[str, Any]:
@@ -146,14 +150,18 @@ def _set(data: dict[str, Any], change: str) -> dict[str, Any]:
         raise ConfigError(f"--set {change}: expected TABLE.KEY=VALUE, e.g. vehicle.mass=+20% or wind.mean_m_s=5")
     if first == "vehicle":
         value = text.strip() if text.strip().endswith("%") else config.value(text)
-        return {**data, "vehicle": {**data.get("vehicle", {}), rest: value}}
+        return {**data, "vehicle": {**data["vehicle"], rest: value}}
+    if first in COMPANION_TABLES:
+        return config.override(data, f"companion.{change}")
     if first in Scenario.__struct_fields__:
-        return config.override({first: {}, **data}, change)
-    tables = [*key.strip().split(".")[:-1]]
-    empty: dict[str, Any] = {}
-    for table in reversed(tables):
-        empty = {table: empty}
-    return config.override(_over(data, {"companion": empty}), f"companion.{change}")
+        return config.override(data, change)
+    return config.override(_over(data, {"companion": {"tune": {first: {}}}}), f"companion.tune.{change}")
+
+
+def _companion_tables() -> dict[str, Any]:
+    """The companion's own defaults where --set may change them by a percentage."""
+    defaults = msgspec.to_builtins(Companion())
+    return {name: defaults[name] for name in COMPANION_TABLES}
 
 
 def _over(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:

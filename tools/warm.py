@@ -1,18 +1,116 @@
-"""Compile every kernel once, with progress; a second run finds them in the cache and returns at once."""
+"""Compile every kernel once, with progress; a second run finds them in the cache and returns at once.
 
+`python -m tools.warm`, and `make install` for it. What is compiled: each controller with its estimator in the companion's own warm-up, the
+compensator, the observers, the simulated vehicles, the reader of logs, and what a paper's module compiles in its `warm()`.
+"""
+
+import argparse
+import importlib
 import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mavquad import jit
+from mavquad.errors import MavquadError
+
+if TYPE_CHECKING:
+    from tools.scenarios import Resolved
+
+Step = tuple[str, Callable[[], object]]
 
 
-def main() -> int:
-    """Compile what is not compiled yet."""
-    stamp = jit.CACHE_FOLDER / "warm" if jit.COMPILED else None
-    if stamp is None or stamp.exists():
+def main(argv: list[str] | None = None) -> int:
+    """Compile what is not compiled yet. 1 where a part of it failed."""
+    parser = argparse.ArgumentParser(prog="python -m tools.warm", description=__doc__.splitlines()[0])  # type: ignore[union-attr]
+    parser.parse_args(argv)
+    if not jit.COMPILED or _stamp("everything").exists():
         return 0
-    print("compiling kernels (once)", file=sys.stderr)
-    stamp.touch()
-    return 0
+    failed = 0
+    todo = list(steps())
+    for i, (label, step) in enumerate(todo, 1):
+        begun = time.monotonic()
+        print(f"compiling kernels (once), {i} of {len(todo)}: {label} ...", end="", file=sys.stderr, flush=True)
+        try:
+            step()
+            print(f" {time.monotonic() - begun:.1f} s", file=sys.stderr, flush=True)
+        except MavquadError as error:  # the rest is still worth compiling
+            failed += 1
+            print(f" {error}", file=sys.stderr, flush=True)
+    if not failed:
+        _stamp("everything").touch()
+    return 1 if failed else 0
+
+
+def ensure(label: str, step: Callable[[], object], say: Callable[[str], None]) -> None:
+    """Run `step` once for these sources, before processes that must not wait for the compiler."""
+    if not jit.COMPILED or _stamp("everything").exists() or _stamp(label).exists():
+        return
+    say(f"compiling kernels (once): {label}")
+    step()
+    _stamp(label).touch()
+
+
+def steps() -> Iterator[Step]:
+    """Everything there is to compile, each with its name."""
+    from mavquad.plan import COMPENSATORS, CONTROLLERS, OBSERVERS
+
+    yield "reading logs", _logs
+    yield "the simulated vehicle", _sitl
+    for name in OBSERVERS:
+        yield f"observer {name}", lambda name=name: _stages(observers=[name])  # type: ignore[misc]
+    for name in CONTROLLERS:
+        yield f"controller {name}", lambda name=name: _stages(controller=name)  # type: ignore[misc]
+    for name in COMPENSATORS:
+        yield f"compensator {name}", lambda name=name: _stages(compensator=name)  # type: ignore[misc]
+    for path in sorted((Path(__file__).parent / "papers").glob("*.py")):
+        if "\ndef warm(" in path.read_text(encoding="utf-8"):
+            yield f"paper {path.stem}", importlib.import_module(f"tools.papers.{path.stem}").warm
+
+
+def _stages(**chosen: object) -> None:
+    """The warm-up of a companion with what is chosen, nothing else beside it."""
+    from mavquad import config, plan, warm
+    from mavquad.settings import Companion
+
+    warm.run(plan.build(config.convert({"observers": [], **chosen}, Companion, "warm")))
+
+
+def flight(resolved: "Resolved") -> None:
+    """What one flight needs, in both of its programs and for its score."""
+    from mavquad import plan, warm
+
+    warm.run(plan.build(resolved.companion))
+    _sitl()
+    _logs()
+
+
+def _sitl() -> None:
+    """A second of the simulated vehicle, alone."""
+    from sitl.config import Sitl
+    from sitl.simulation import Simulation
+
+    Simulation(Sitl()).run_until(1_000_000)
+
+
+def _logs() -> None:
+    """A log of a few frames, read by columns."""
+    from mavquad import wire
+    from mavquad.link import tlog
+    from mavquad.link.columns import Log
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "warm.tlog"
+        with tlog.Writer(path) as writer:
+            for i in range(3):
+                writer.write(i, wire.encode("HEARTBEAT", (2, 12, 0, 0, 4, 3), seq=i, system=1, component=1))
+        Log(path).columns("HEARTBEAT")
+
+
+def _stamp(label: str) -> Path:
+    return jit.CACHE_FOLDER / f"warm {label}".replace(" ", "-").replace("/", "-")
 
 
 if __name__ == "__main__":

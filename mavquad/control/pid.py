@@ -75,16 +75,24 @@ def init(gains: Gains) -> State:
 
 
 @kernel
+def drag_at(gains: Gains, v: Vec3) -> Vec3:
+    """The acceleration that keeps the airframe's own drag off at this velocity in still air; NED."""
+    d1, d2 = gains.drag_linear_1_s, gains.drag_quadratic_1_m
+    speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    return ((d1[0] + d2[0] * speed) * v[0], (d1[1] + d2[1] * speed) * v[1], (d1[2] + d2[2] * speed) * v[2])
+
+
+@kernel
 def law(
     gains: Gains, integral: Vec3, p: Vec3, v: Vec3, p_ref: Vec3, v_ref: Vec3, a_ref: Vec3, dt_s: float
 ) -> tuple[Vec3, Vec3]:
     """(integral, acceleration), NED."""
-    kp, kd, ki, d1, d2, a_max, i_max = gains
-    speed = math.sqrt(v_ref[0] * v_ref[0] + v_ref[1] * v_ref[1] + v_ref[2] * v_ref[2])
+    kp, kd, ki, _, _, a_max, i_max = gains
+    drag = drag_at(gains, v_ref)
     ex, ey, ez = p_ref[0] - p[0], p_ref[1] - p[1], p_ref[2] - p[2]
-    ax = a_ref[0] + (d1[0] + d2[0] * speed) * v_ref[0] + kp * ex + kd * (v_ref[0] - v[0]) + integral[0]
-    ay = a_ref[1] + (d1[1] + d2[1] * speed) * v_ref[1] + kp * ey + kd * (v_ref[1] - v[1]) + integral[1]
-    az = a_ref[2] + (d1[2] + d2[2] * speed) * v_ref[2] + kp * ez + kd * (v_ref[2] - v[2]) + integral[2]
+    ax = a_ref[0] + drag[0] + kp * ex + kd * (v_ref[0] - v[0]) + integral[0]
+    ay = a_ref[1] + drag[1] + kp * ey + kd * (v_ref[1] - v[1]) + integral[1]
+    az = a_ref[2] + drag[2] + kp * ez + kd * (v_ref[2] - v[2]) + integral[2]
     size = math.sqrt(ax * ax + ay * ay)
     ix, iy, iz = integral
     if size > a_max:
@@ -114,6 +122,7 @@ def step(gains: Gains, state: State, estimate: Estimate, demand: Demand, preview
         demand.a_ned_m_s2,
         dt_s,
     )
-    # the integral is a disturbance already cancelled: a compensator must not cancel it again
-    cancelled = (-integral[0], -integral[1], -integral[2])
+    # the integral and the drag of the present speed are already cancelled: a compensator must not cancel them again
+    drag = drag_at(gains, estimate.v_ned_m_s)
+    cancelled = (-integral[0] - drag[0], -integral[1] - drag[1], -integral[2] - drag[2])
     return State(integral), Command(a, demand.yaw_rad, demand.yaw_rate_rad_s, NAN3, cancelled)

@@ -125,13 +125,27 @@ def current_gains(w0_rad_s: float, dt_s: float, order: int = 3, pattern: str = "
     return scaled / dt_s ** np.arange(order)
 
 
-def ramp_gains(Lc: np.ndarray, dt_s: float) -> np.ndarray:
-    """Lff (3,) = eps/e of the current form: steady error per innovation while d grows at a constant rate."""
-    phi, _ = chain(3, dt_s)
-    w = np.array([dt_s**3 / 6.0, dt_s**2 / 2.0, dt_s])
-    left = np.eye(3) - np.outer(Lc, [1.0, 0.0, 0.0])
-    eps = np.linalg.solve(np.eye(3) - left @ phi, left @ w)
-    return eps / (phi @ eps + w)[0]
+@kernel
+def closed_form(w0_rad_s: float, dt_s: float, butterworth: bool) -> tuple[float, float, float]:
+    """Lc of the current form of order 3, for a period that changes from sample to sample."""
+    b = math.exp(-w0_rad_s * dt_s)
+    if butterworth:  # poles exp(-w dt) and exp(-w dt/2 (1 +- i sqrt 3))
+        m = math.exp(-0.5 * w0_rad_s * dt_s)
+        c = 2.0 * m * math.cos(0.5 * math.sqrt(3.0) * w0_rad_s * dt_s)
+        a2, a1, a0 = -b - c, m * m + b * c, -b * m * m
+    else:
+        a2, a1, a0 = -3.0 * b, 3.0 * b * b, -b * b * b
+    return (1.0 + a0, (3.0 + a2 - a1 - 3.0 * a0) / (2.0 * dt_s), (1.0 + a2 + a1 + a0) / (dt_s * dt_s))
+
+
+@kernel
+def ramp_gains(Lc: tuple[float, float, float], dt_s: float) -> tuple[float, float, float]:
+    """Lff = eps/e of the current form of order 3: steady error per innovation while d grows at a constant rate.
+
+    In that state e = dt/L3, so eps3 = (L2/L3 - dt/2) per unit rate: the lag that is to be made up, 3/w0 for small dt.
+    """
+    f3 = (Lc[1] - 0.5 * dt_s * Lc[2]) / dt_s
+    return (1.0 - Lc[0], (Lc[0] - dt_s * dt_s * (Lc[2] / 6.0 + 0.5 * f3)) / dt_s, f3)
 
 
 def _channel(p: LesoParams, w0: float, g: float) -> tuple[np.ndarray, ...]:
@@ -143,7 +157,7 @@ def _channel(p: LesoParams, w0: float, g: float) -> tuple[np.ndarray, ...]:
         L[:n] = current_gains(w0, p.dt_s, n, p.pattern)
         A[:n, :n], B[:n] = phi, gam
         if n == 3:
-            F[:3] = ramp_gains(L[:3], p.dt_s)
+            F[:3] = ramp_gains((float(L[0]), float(L[1]), float(L[2])), p.dt_s)
     else:
         flow = np.zeros((n + 2, n + 2))
         flow[np.arange(n - 1), np.arange(1, n)] = 1.0

@@ -25,6 +25,7 @@ class Client:
         self.counts, self.last, self.texts, self.acks = Counter(), {}, [], {}
         self.history = []
         self._seq, self._keep = 0, None
+        self.on = lambda m: None
 
     def send(self, name, *fields):
         self.sim.receive(self.link, wire.encode(name, fields, seq=self._seq, system=1, component=191))
@@ -51,6 +52,7 @@ class Client:
     def _take(self, m):
         name = type(m).__name__
         self.counts[name] += 1
+        self.on(m)
         self.last[name] = m
         if name == "STATUSTEXT":
             self.texts.append(m.text)
@@ -369,3 +371,127 @@ def test_an_endpoint_in_use_is_said_in_one_line():
     assert done.returncode == 1
     assert done.stderr.startswith(f"sitl: udpin:127.0.0.1:{port}: cannot listen there: Address already in use;")
     assert done.stderr.count("\n") == 1
+
+
+# ---- parameters, several peers, a bad wire --------------------------------------------------------------------------------
+def test_parameters_are_listed_read_set_and_at_work():
+    c = Client()
+    c.run(0.5)
+    seen = {}
+    c.on = lambda m: seen.update({m.param_id: m}) if type(m).__name__ == "PARAM_VALUE" else None
+    c.send("PARAM_REQUEST_LIST", 1, 1)
+    c.run(1.0)
+    assert len(seen) == seen["MPC_XY_P"].param_count == len(c.sim.autopilot.params)
+    assert {m.param_index for m in seen.values()} == set(range(len(seen)))
+    c.send("PARAM_SET", 1, 1, "MPC_XY_P", 1.5, 9)
+    c.send("PARAM_REQUEST_READ", 1, 1, "", seen["MPC_TKO_SPEED"].param_index)
+    c.send("PARAM_REQUEST_READ", 1, 1, "NO_SUCH_NAME", -1)
+    seen.clear()
+    c.run(0.1)
+    assert set(seen) == {"MPC_XY_P", "MPC_TKO_SPEED"}
+    assert seen["MPC_XY_P"].param_value == 1.5
+    assert c.sim.vehicle.constants["position_p"][0] == 1.5
+
+
+def test_frames_are_routed_to_where_their_addressee_was_heard():
+    c = Client()
+    c.run(0.2)
+    station, bystander = c.sim.open_link(), c.sim.open_link()
+    heartbeat = wire.encode("HEARTBEAT", (6, 8, 0, 0, 4, 3), seq=0, system=255, component=190)
+    c.sim.receive(station, heartbeat)
+    c.sim.receive(bystander, wire.encode("HEARTBEAT", (6, 8, 0, 0, 4, 3), seq=0, system=254, component=190))
+    got = {"station": [], "bystander": []}
+
+    def listen():
+        c.period()
+        for name, link in (("station", station), ("bystander", bystander)):
+            for data in c.sim.collect(link):
+                got[name] += [frame for frame in wire.split(data)[0] if frame.system != 1 or frame.component != 1]
+
+    c.send("HEARTBEAT", 18, 8, 0, 0, 4, 3)  # for everybody
+    for _ in range(5):
+        listen()
+    assert [f.msgid for f in got["station"]] == [f.msgid for f in got["bystander"]] == [0, 0]  # each other's and ours
+    c.send("COMMAND_LONG", 255, 190, 31000, 0, *(0.0,) * 7)  # for the station alone
+    c.send("PARAM_SET", 1, 1, "MPC_XY_P", 1.0, 9)  # for the autopilot alone
+    for _ in range(5):
+        listen()
+    assert [f.msgid for f in got["station"]][2:] == [76]
+    assert len(got["bystander"]) == 2
+    c.sim.receive(station, wire.encode("COMMAND_LONG", (1, 191, 300, 0, *(0.0,) * 7), seq=1, system=255, component=190))
+    c.run(0.1)
+    assert c.last["COMMAND_LONG"].command == 300  # a ground station reaches the companion through the autopilot
+
+
+def test_links_have_their_own_rates_and_sequences():
+    c = Client("link.delay_ms=0")
+    c.run(0.1)
+    other = c.sim.open_link()
+    c.command(511, 31, -1)
+    c.run(0.1)
+    c.sim.collect(other)
+    before = c.counts["ATTITUDE_QUATERNION"]
+    c.run(0.2)
+    frames = [frame for data in c.sim.collect(other) for frame in wire.split(data)[0]]
+    assert c.counts["ATTITUDE_QUATERNION"] == before
+    assert sum(frame.msgid == 31 for frame in frames) == 50
+    assert all((b.seq - a.seq) & 0xFF == 1 for a, b in pairwise(frames))
+
+
+def test_a_bad_wire_is_survived_and_loss_shows_in_the_sequence():
+    c = Client("link.loss=0.05", "link.corrupt=0.02", "link.duplicate=0.02", "link.jitter_ms=4", "link.reorder=0.01")
+    gaps = received = 0
+    last = None
+    refused = 0
+    for _ in range(400):
+        c.send("HEARTBEAT", 18, 8, 0, 0, 4, 3)
+        c.sim.run_period()
+        for data in c.sim.collect(c.link):
+            frames, junk, rest = wire.split(data)
+            refused += junk + len(rest)
+            for frame in frames:
+                received += 1
+                gaps += last is not None and (frame.seq - last) & 0xFF != 1
+                last = frame.seq
+    counts = c.link.down.counts
+    assert min(counts.values()) > 10
+    assert refused > 0
+    assert gaps > counts["lost"] / 2
+    # a changed length byte hides its neighbours in the datagram, a changed id passes as an unknown message: a few either way
+    whole = c.link.sent - counts["lost"] - counts["corrupted"] + counts["duplicated"]
+    assert received == pytest.approx(whole, abs=counts["corrupted"])
+    assert c.link.refused > 0  # corrupted on the way up
+
+
+def test_a_forwarded_copy_holds_both_directions(tmp_path):
+    monitor = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    monitor.bind(("127.0.0.1", 0))
+    monitor.settimeout(30.0)
+    probe = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    probe.bind(("127.0.0.1", 0))
+    port = probe.getsockname()[1]
+    probe.close()
+    words = f"-P -m sitl --endpoint udpin:127.0.0.1:{port} --forward udpout:127.0.0.1:{monitor.getsockname()[1]} --speed 20"
+    process = subprocess.Popen([sys.executable, *words.split()], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    client = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    client.settimeout(0.2)
+    hello = wire.encode("HEARTBEAT", (18, 8, 0, 0, 4, 3), seq=0, system=1, component=191)
+    try:
+        for _ in range(300):
+            client.sendto(hello, ("127.0.0.1", port))
+            try:
+                client.recv(65536)
+                break
+            except (TimeoutError, ConnectionRefusedError):
+                continue
+        senders = set()
+        for _ in range(50):
+            senders |= {(frame.system, frame.component) for frame in wire.split(monitor.recv(65536))[0]}
+        assert senders == {(1, 1), (1, 191)}
+    finally:
+        process.terminate()  # ends cleanly, with its report
+        stdout, stderr = process.communicate(timeout=20)
+        client.close()
+        monitor.close()
+    assert process.returncode == 0, stderr
+    assert json.loads(stdout)["messages_sent"] > 0

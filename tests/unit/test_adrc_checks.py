@@ -1,4 +1,4 @@
-"""control/adrc_checks: the numbers of the method's note, and what is refused."""
+"""adrc_checks: the numbers of the method's note, and what is refused."""
 
 import math
 
@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mavquad import adrc_checks as checks
 from mavquad import airframe
-from mavquad.control import adrc_checks as checks
 from mavquad.errors import ConfigError
 from mavquad.estimate import leso
 

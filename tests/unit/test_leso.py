@@ -55,6 +55,21 @@ def test_the_current_gains_are_the_note_s_closed_form(w0):
     np.testing.assert_allclose(leso.current_gains(w0, DT), expected, rtol=1e-11)
 
 
+@given(w0=w0s, pattern=patterns, dt=st.floats(1e-3, 0.03))
+def test_the_closed_form_is_the_placement_and_its_ramp_gains_are_the_steady_state(w0, pattern, dt):
+    Lc = leso.current_gains(w0, dt, 3, pattern)
+    np.testing.assert_allclose(leso.closed_form(w0, dt, pattern == "butterworth"), Lc, rtol=1e-7)
+    phi, w = dense.expm(np.diag([1.0, 1.0], 1) * dt), np.array([dt**3 / 6, dt**2 / 2, dt])
+    left = np.eye(3) - np.outer(Lc, [1.0, 0.0, 0.0])
+    eps = np.linalg.solve(np.eye(3) - left @ phi, left @ w)  # the error equation at rest under a ramp of slope 1
+    np.testing.assert_allclose(leso.ramp_gains(tuple(map(float, Lc)), dt), eps / (phi @ eps + w)[0], rtol=1e-6)
+
+
+def test_the_note_s_ramp_gain():
+    Lc = leso.closed_form(20.0, 0.005, False)
+    assert leso.ramp_gains(Lc, 0.005)[2] == pytest.approx(1017.8, abs=0.05)
+
+
 @given(w0=w0s, pattern=patterns, order=orders, seed=st.integers(0, 1000))
 def test_both_forms_agree_with_a_dense_oracle(w0, pattern, order, seed):
     rng = np.random.default_rng(seed)

@@ -74,3 +74,13 @@ def test_drag_along_the_path_is_fed_forward():
 def test_an_integral_at_the_edge_of_stability_is_refused():
     with pytest.raises(ConfigError, match="edge of stability"):
         pid.Params(integral=1.0)
+
+
+def test_the_drag_fed_forward_counts_as_cancelled_at_the_present_speed():
+    gains = pid.gains(pid.Params(), FRAME)
+    moving = Estimate(0, ZERO3, (4.0, -3.0, 0.0), (1.0, 0.0, 0.0, 0.0), ZERO3, NAN3, NAN3)
+    demand = Demand(0, ZERO3, (4.0, -3.0, 0.0), ZERO3, ZERO3, 0.0, 0.0)
+    _, command = pid.step(gains, pid.init(gains), moving, demand, None, 0.008)
+    np.testing.assert_allclose(np.array(command.a_ned_m_s2) + command.f_cancelled_m_s2, 0.0, atol=1e-12)
+    per_speed = (FRAME.drag.linear_n_s_m[0] + 5.0 * FRAME.drag.quadratic_n_s2_m2[0]) / FRAME.body.mass_kg
+    np.testing.assert_allclose(command.f_cancelled_m_s2[0], -4.0 * per_speed)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mavquad.control.cascade import Body
+from mavquad.control.iadrc import Body
 from mavquad.errors import ConfigError
 from mavquad.estimate import ekf, joint, leso
 from tools.papers.joint_observer.augmented import AugmentedGains

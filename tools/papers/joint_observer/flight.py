@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mavquad import quat
-from mavquad.control import cascade
+from mavquad.control import iadrc
 from mavquad.estimate import ekf, joint
 from mavquad.jit import kernel
 from tools.papers.joint_observer import augmented
@@ -18,7 +18,7 @@ ESO, AUGMENTED = 0, 1
 class Law(NamedTuple):
     """The cascade's settings, and which of the note's variants it is."""
 
-    body: cascade.Body
+    body: iadrc.Body
     wc_position: tuple[float, float, float]
     wc_attitude: tuple[float, float, float]
     command_filter_rad_s: float
@@ -75,7 +75,7 @@ def fly(
     measured = np.empty((n, 12))
     inputs = np.zeros((n, 4))  # applied T/m and torque
     known = np.zeros((n, 6))
-    still = cascade.CommandFilter(0.0, 0.0, 0.0)
+    still = iadrc.CommandFilter(0.0, 0.0, 0.0)
     roll, pitch = still, still
     base = 0.25 * body.mass_kg * body.gravity_m_s2
     motors = (base, base, base, base)
@@ -124,22 +124,22 @@ def fly(
         wished = 8.0 / body.mass_kg
         if not plant.fixed:
             r = reference[k]
-            want = cascade.position_law(
+            want = iadrc.position_law(
                 law.wc_position, est.p_ned_m, est.v_ned_m_s, f, (r[0], r[1], r[2]), (r[3], r[4], r[5]), zero3
             )
-            force = cascade.limit_force(body, want, est.v_ned_m_s, law.tilt_max_rad)
-            wished, phi, theta = cascade.thrust_and_angles(force, est.eta_rad[2])
-            roll = cascade.filter_command(roll, phi, law.command_filter_rad_s, dt_s)
-            pitch = cascade.filter_command(pitch, theta, law.command_filter_rad_s, dt_s)
+            force = iadrc.limit_force(body, want, est.v_ned_m_s, law.tilt_max_rad)
+            wished, phi, theta = iadrc.thrust_and_angles(force, est.eta_rad[2])
+            roll = iadrc.filter_command(roll, phi, law.command_filter_rad_s, dt_s)
+            pitch = iadrc.filter_command(pitch, theta, law.command_filter_rad_s, dt_s)
         run.reference[k, 0], run.reference[k, 1], run.reference[k, 2] = roll.angle, pitch.angle, 0.0
-        torque = cascade.attitude_law(body, law.wc_attitude, est.eta_rad, est.omega_rad_s, tau, (roll, pitch, still))
-        command = cascade.mix(body, body.mass_kg * wished, torque)
+        torque = iadrc.attitude_law(body, law.wc_attitude, est.eta_rad, est.omega_rad_s, tau, (roll, pitch, still))
+        command = iadrc.mix(body, body.mass_kg * wished, torque)
         for i in range(4):
             run.rotors[k, i] = command[i]
         mean = command
         if law.motor_model:
-            motors, mean = cascade.lag(motors, command, body.motor_lag_s, dt_s)
-        total, applied = cascade.unmix(body, mean)
+            motors, mean = iadrc.lag(motors, command, body.motor_lag_s, dt_s)
+        total, applied = iadrc.unmix(body, mean)
         inputs[k, 0], inputs[k, 1], inputs[k, 2], inputs[k, 3] = total / body.mass_kg, applied[0], applied[1], applied[2]
         known[k] = joint.known_acceleration(model, est.eta_rad, est.v_ned_m_s, est.omega_rad_s, inputs[k, 0], applied)
         if not law.feed_applied and not plant.fixed:

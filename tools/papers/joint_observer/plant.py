@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 from mavquad import quat
-from mavquad.control.cascade import Body, Four, unmix
+from mavquad.control.iadrc import Body, Four, unmix
 from mavquad.jit import kernel
 
 Vec3 = tuple[float, float, float]

@@ -1,0 +1,156 @@
+"""mavquad fly: one flight of the companion with the simulated autopilot, two processes over UDP; a run folder with its report.
+
+Scenarios: circle (default), ellipse, gusty, hover, line, rectangle, spiral, or a TOML file of your own.
+Changes: --set vehicle.mass=+20%  --set wind.mean_m_s=5  --set path.radius_m=2  --set pid.ki=0.4  --set limits.tilt_deg=30
+
+Example:
+  mavquad fly circle --seed 7 --controller pid
+  mavquad fly gusty --personality ardupilot --set wind.mean_m_s=7 --json
+"""
+
+import argparse
+import json
+import math
+import shlex
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from mavquad.errors import FlightError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of a flight."""
+    parser.add_argument(
+        "scenario", nargs="?", default="circle", help="a scenario's name, or a TOML file (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=1, help="of wind, noise and faults (default: %(default)s)")
+    parser.add_argument(
+        "--personality", choices=("px4", "ardupilot"), default="px4", help="whose autopilot (default: %(default)s)"
+    )
+    parser.add_argument("--airframe", default="x500", help="a vehicle's name, or a TOML file (default: %(default)s)")
+    parser.add_argument("--controller", help="pd, pid, adrc, iadrc, eskf-mpc, or autopilot (its own position loop)")
+    parser.add_argument("--estimator", help="what feeds the controller (default: the controller's own)")
+    parser.add_argument("--compensator", help="none or asmf")
+    parser.add_argument("--observer", action="append", metavar="NAME[:KEY=VALUE,...]", help="one more to watch; again for more")
+    parser.add_argument(
+        "--attitude", choices=("ahrs", "mocap", "both"), default="ahrs", help="attitude source (default: %(default)s)"
+    )
+    parser.add_argument("--loop", choices=("attitude", "rates"), help="what setpoints carry")
+    parser.add_argument("--speed", type=float, metavar="F", help="F times real time (default: lockstep, as fast as it goes)")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change anything; again for more")
+    parser.add_argument("--run", type=Path, metavar="DIR", help="run folder (default: runs/<time>-<scenario>-<seed>)")
+    parser.add_argument("--no-report", action="store_true", help="write no report.html")
+    parser.add_argument("--json", action="store_true", help="print summary.json instead of the table")
+
+
+def run(args: argparse.Namespace) -> int:
+    """One flight. 0 where it went well, 1 where not."""
+    from mavquad import plan
+    from tools import flight, scenarios, summary, warm
+
+    if args.speed is not None and not 0.01 <= args.speed <= 1000.0:
+        raise FlightError(f"--speed {args.speed}: expected 0.01 to 1000 times real time, or no --speed for lockstep")
+    resolved = scenarios.resolve(scenarios.load(args.scenario, args.set), _options(args))
+    plan.build(resolved.companion)  # what is wrong with it is known before anything starts
+    name = Path(args.scenario).stem
+    folder = args.run or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}-{args.seed}"
+    flight.prepare(folder, resolved)
+    max_time_s = resolved.scenario.flight.max_time_s
+    signal.signal(signal.SIGTERM, _terminated)
+    with Progress(summary.path_duration_s(resolved.companion), quiet=args.json) as progress:
+        warm.ensure(f"flight {_stages(resolved.companion)}", lambda: warm.flight(resolved), progress.say)
+        flown = flight.fly(folder, flight.Pace(args.speed), max_time_s, progress.watch)
+        progress.say("scoring")
+        result = summary.summarise(folder, name, resolved, flown, _command(args), args.speed is None)
+    if args.json:
+        print(json.dumps(result, allow_nan=False))
+    else:
+        summary.show(result, folder)
+    if not result["ok"]:
+        raise FlightError(f"the flight was not as it should be: {'; '.join(result['failures'])}; its logs are in {folder}")
+    return 0
+
+
+def _options(args: argparse.Namespace) -> Any:
+    from tools.scenarios import Options
+
+    return Options(
+        seed=args.seed,
+        airframe=args.airframe,
+        personality=args.personality,
+        attitude=args.attitude,
+        controller=args.controller,
+        estimator=args.estimator,
+        compensator=args.compensator,
+        observers=args.observer,
+        loop=args.loop,
+    )
+
+
+def _stages(companion: Any) -> str:
+    names = (companion.controller, companion.estimator, companion.compensator, *companion.observers)
+    return " ".join(name.replace(":", " ").replace(",", " ") for name in names)
+
+
+def _command(args: argparse.Namespace) -> str:
+    """The command that repeats this flight."""
+    words = ["mavquad", "fly", args.scenario, "--seed", str(args.seed)]
+    for name in ("personality", "airframe", "controller", "estimator", "compensator", "attitude", "loop", "speed"):
+        value = getattr(args, name)
+        if value not in (None, {"personality": "px4", "airframe": "x500", "attitude": "ahrs"}.get(name)):
+            words += [f"--{name}", str(value)]
+    for name in ("observer", "set"):
+        for value in getattr(args, name) or []:
+            words += [f"--{name}", value]
+    return shlex.join(words)
+
+
+def _terminated(*_: Any) -> None:
+    raise KeyboardInterrupt
+
+
+class Progress:
+    """Progress in vehicle time on stderr: a bar on a terminal, else a line for each change of state."""
+
+    def __init__(self, path_s: float, quiet: bool = False) -> None:
+        self._path_s = path_s
+        self._engaged_s = math.nan
+        self._live: Any = None
+        self._task: Any = None
+        self._lines = not sys.stderr.isatty() and not quiet
+        self._bar = sys.stderr.isatty()
+
+    def __enter__(self) -> "Progress":
+        if self._bar:
+            from rich.console import Console
+            from rich.progress import BarColumn, Progress, TextColumn
+
+            columns = (TextColumn("{task.fields[t]:>8}"), BarColumn(), TextColumn("{task.description}"))
+            self._live = Progress(*columns, console=Console(stderr=True), transient=True)
+            self._task = self._live.add_task("starting", total=self._path_s, t="")
+            self._live.start()
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def watch(self, t_s: float, said: list[str]) -> None:
+        """The companion's vehicle time and what it has said since the last call."""
+        for line in said:
+            if "engaged:" in line and math.isnan(self._engaged_s):
+                self._engaged_s = t_s
+            self.say(line.strip())
+        if self._live is not None and not math.isnan(t_s):
+            done = 0.0 if math.isnan(self._engaged_s) else min(self._path_s, max(0.0, t_s - self._engaged_s))
+            self._live.update(self._task, completed=done, t=f"{t_s:.1f} s")
+
+    def say(self, words: str) -> None:
+        """What is being done now."""
+        if self._live is not None:
+            self._live.update(self._task, description=words)
+        elif self._lines:
+            print(words, file=sys.stderr, flush=True)
