@@ -1,15 +1,19 @@
 """An identified vehicle as an airframe file: what the log told with its spread, what it could not with where it comes from instead."""
 
-import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mavquad import airframe, config
 from mavquad.airframe import Airframe
 from mavquad.errors import LogError
+from mavquad.identify.bounds import TICK_S
 from mavquad.identify.vehicle import Figure
 from tools.identified import Identified, Response
+
+if TYPE_CHECKING:
+    from tools.calibrate import Calibration
 
 
 def combined(responses: list[Response]) -> tuple[float, float, float, float]:
@@ -24,10 +28,8 @@ def combined(responses: list[Response]) -> tuple[float, float, float, float]:
     return gain, wn, zeta, delay
 
 
-def written(
-    found: Identified, base: Airframe, base_name: str, name: str, bounds: dict[str, tuple[float, str]] | None = None
-) -> str:
-    """The file's text. `base` gives mass, inertia and rotors, which no log tells; `bounds` are (value, reason) by key.
+def written(found: Identified, base: Airframe, base_name: str, name: str, calibration: "Calibration | None" = None) -> str:
+    """The file's text. `base` gives mass, inertia and rotors, which no log tells; `calibration` gives the bounds.
 
     Raises LogError where the log has no attitude response.
     """
@@ -88,9 +90,16 @@ def written(
         f"delay_s = {delay:.4f}  # {pm(3)}",
         f"gain = {gain:.4g}  # {pm(0)}",
     ]
-    if bounds:
-        lines += ["", "[bounds]  # of the set-membership filter, each with the part of the log that set it"]
-        lines += [f"{key} = {value:.4g}  # {why}" if math.isfinite(value) else "" for key, (value, why) in bounds.items()]
+    if calibration is not None:
+        c = calibration
+        lines += [
+            "",
+            f"[bounds]  # of the set-membership filter, from {c.span_s[0]:.0f}-{c.span_s[1]:.0f} s; each with what set it",
+        ]
+        lines += [
+            f"{key} = {b.value:.4g}  # largest seen {b.largest_seen:.3g} at {b.at_s:.1f} s" for key, b in c.bounds.items()
+        ]
+        lines.append(f"tick_s = {TICK_S:g}")
     return "\n".join(lines) + "\n"
 
 

@@ -12,12 +12,17 @@ import json
 import math
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mavquad import airframe
 from mavquad.errors import ConfigError, LogError
 from tools import airframe_toml, identified, identify_log
 from tools.identified import Identified, Span
+
+if TYPE_CHECKING:
+    from tools.calibrate import Calibration
+
+THRUST_LAG_S = 0.05  # of an airframe that says nothing of its rotors
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,29 +46,42 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"--out takes one log, got {len(args.log)}; an airframe file comes from one flight")
     fit_s, check_s = span(args.fit, "--fit"), span(args.check, "--check")
     base = airframe.load(args.airframe)
-    everything, problems = [], []
+    everything: list[Identified] = []
+    calibrations: list[Calibration] = []
+    problems: list[str] = []
     for path in args.log:
         print(f"reading {path}", file=sys.stderr, flush=True)
         found = identified.identify(identify_log.read(path), fit_s, check_s)
         everything.append(found)
-        if not found.of("SET_ATTITUDE_TARGET"):
+        if args.bounds:
+            from tools import calibrate  # the filter's kernels: only where it is tried
+
+            calibrations.append(calibrate.calibrate(found, base.rotors.lag_s if base.rotors else THRUST_LAG_S))
+        if not found.of("SET_ATTITUDE_TARGET") and (args.out or not args.bounds):
             reasons = [m for m in found.missing if "SET_ATTITUDE_TARGET" in m]
             problems.append(f"{path}: no response from commands as sent: {reasons[0] if reasons else 'nothing was commanded'}")
     if args.json:
-        json.dump({"logs": [_plain(identified.summary(found)) for found in everything]}, sys.stdout, allow_nan=False)
+        logs = [identified.summary(found) for found in everything]
+        for one, calibration in zip(logs, calibrations, strict=False):
+            one["bounds"] = _bounds_summary(calibration)
+        json.dump({"logs": _plain(logs)}, sys.stdout, allow_nan=False)
         print()
     else:
-        print("\n\n".join(text(found) for found in everything))
+        shown = [text(found) for found in everything]
+        for i, calibration in enumerate(calibrations):
+            shown[i] += "\n\n" + bounds_text(calibration)
+        print("\n\n".join(shown))
     if args.report:
         from tools import identify_page
 
-        args.report.write_text(identify_page.page_of(everything), encoding="utf-8")
+        args.report.write_text(identify_page.page_of(everything, calibrations), encoding="utf-8")
         print(f"report: {args.report}", file=sys.stderr)
     if problems:
         raise LogError(problems[0])
     if args.out:
         name = args.name or args.out.stem
-        airframe_toml.write(args.out, airframe_toml.written(everything[0], base, args.airframe, name))
+        own = calibrations[0] if calibrations else None
+        airframe_toml.write(args.out, airframe_toml.written(everything[0], base, args.airframe, name, own))
         print(f"airframe: {args.out} (mass, inertia and rotors from {args.airframe})", file=sys.stderr)
     return 0
 
@@ -135,6 +153,38 @@ def text(found: Identified) -> str:
     if found.notes:
         lines += ["", "notes:"] + [f"  {n}" for n in found.notes]
     return "\n".join(lines)
+
+
+def bounds_text(c: "Calibration") -> str:
+    """The bounds of the set-membership filter for a terminal, each with the part of the log that set it."""
+    lines = [
+        f"bounds for the set-membership filter, from {c.span_s[0]:.0f}-{c.span_s[1]:.0f} s, commands {c.source}, per tick of 20 ms:",
+        *(
+            f"  {key:20} {b.value:.4g} {b.unit:15} largest seen {b.largest_seen:.3g} at {b.at_s:.1f} s"
+            for key, b in c.bounds.items()
+        ),
+        f"  the filter over this flight: {c.own.contradictions} contradictions, half-width of f {c.own.half_width_m_s2:.2f} m/s^2;"
+        f" with the default bounds {c.default.contradictions} and {c.default.half_width_m_s2:.2f} m/s^2",
+        "  guaranteed while a flight's noise and changes stay within these; what did not happen in this log is covered by the margin only",
+    ]
+    if c.rounds:
+        lines.append(f"  widened {c.rounds} times by 15 % until nothing contradicted")
+    if c.own.contradictions:
+        lines.append(
+            f"  STILL contradicted, first at {c.own.first_s:.1f} s: the model does not fit this flight; do not fly with these"
+        )
+    return "\n".join(lines)
+
+
+def _bounds_summary(c: "Calibration") -> dict[str, Any]:
+    return {
+        "span_s": c.span_s,
+        "input": c.source,
+        "rounds": c.rounds,
+        **{key: b._asdict() for key, b in c.bounds.items()},
+        "own": c.own._asdict(),
+        "default": c.default._asdict(),
+    }
 
 
 def _pm(value: float, sd: float, digits: int) -> str:

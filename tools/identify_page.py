@@ -1,6 +1,7 @@
 """The page of `mavquad identify`: Bode plots with coherence and error bands, model over data, the check, the tables."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -8,10 +9,21 @@ from mavquad.identify import attitude
 from tools import bode, page
 from tools.identified import Identified, Response
 
+if TYPE_CHECKING:
+    from tools.calibrate import Calibration
 
-def page_of(everything: Sequence[Identified]) -> str:
-    """One page for one or several logs."""
+
+def page_of(everything: Sequence[Identified], calibrations: "Sequence[Calibration]" = ()) -> str:
+    """One page for one or several logs, with their bounds where they were asked for."""
     sections = [section for found in everything for section in _sections(found)]
+    for c in calibrations:
+        rows = [[key, b.value, b.unit, b.largest_seen, b.at_s] for key, b in c.bounds.items()]
+        tried = (
+            f"Tried by the filter over {c.span_s[0]:.0f}-{c.span_s[1]:.0f} s: {c.own.contradictions} contradictions"
+            f" ({c.default.contradictions} with the default bounds). Guaranteed while noise and changes stay within these bounds."
+        )
+        table = page.table(["bound", "value", "unit", "largest seen", "at, s"], rows)
+        sections.append(("Bounds for the set-membership filter", [table, page.text(tried)]))
     names = ", ".join(found.flight.path.name for found in everything)
     lead = page.text(
         "ATTITUDE_TARGET is what the autopilot made of the command: on ArduCopter after its own shaping, so it shows the inner loop."

@@ -136,3 +136,26 @@ def test_the_real_sweep_meets_its_acceptance(recordings, capsys, tmp_path):
 def test_a_real_log_without_commands_says_what_to_record(recordings, capsys):
     assert program.main(["identify", str(recordings / "arducopter-sitl-flight1.tlog")]) == 1
     assert "no SET_ATTITUDE_TARGET in this log; record" in capsys.readouterr().err
+
+
+def test_bounds_of_the_real_vehicle_are_not_contradicted_by_its_own_flight(recordings, capsys, tmp_path):
+    path, out = recordings / "arducopter-sitl-flight1.tlog", tmp_path / "never.toml"
+    assert program.main(["identify", str(path), "--bounds", "--json"]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["logs"]
+    assert found["bounds"]["default"]["contradictions"] > 50  # the design note's numbers do not fit this flight
+    assert found["bounds"]["own"]["contradictions"] == 0
+    assert program.main(["identify", str(path), "--bounds", "--out", str(out)]) == 1
+    assert not out.exists()
+
+
+def test_bounds_go_into_the_airframe_file(recordings, tmp_path):
+    path, out = recordings / "arducopter-sitl-sweep-calm.tlog", tmp_path / "own.toml"
+    assert program.main(["identify", str(path), "--bounds", "--out", str(out), "--report", str(tmp_path / "page.html")]) == 0
+    loaded = airframe.load(str(out))
+    assert loaded.bounds != airframe.load("x500").bounds
+    assert loaded.bounds.e_velocity_m_s < 0.06
+
+
+def test_bounds_need_an_accelerometer(log, capsys):
+    assert program.main(["identify", str(log), "--bounds"]) == 1
+    assert "bounds need HIGHRES_IMU" in capsys.readouterr().err
