@@ -163,7 +163,9 @@ def drag_along(linear: Vec3, quadratic: Vec3, v: Vec3, a: Vec3) -> tuple[Vec3, V
 
 
 @kernel
-def ahead(g: Gains, p: Vec3, v: Vec3, a: Vec3, rest: Vec3, queue: np.ndarray, now_s: float, delay_s: float):
+def ahead(
+    g: Gains, p: Vec3, v: Vec3, a: Vec3, rest: Vec3, queue: np.ndarray, now_s: float, delay_s: float
+) -> tuple[Vec3, Vec3, Vec3]:
     """(p, v, a) after delay_s: each command acts delay_s after its stamp, the acceleration follows it with the lag.
 
     rest: disturbance beyond the airframe's drag, constant on the way. Exact between the instants at which commands take over,
@@ -223,7 +225,7 @@ def limited(g: Gains, u: Vec3) -> Vec3:
 @kernel
 def law(
     g: Gains, k: Vec3, p: Vec3, v: Vec3, a: Vec3, rest: Vec3, integral: Vec3, p_ref: Vec3, v_ref: Vec3, a_ref: Vec3, j_ref: Vec3
-):
+) -> tuple[Vec3, Vec3]:
     """(command, path part of the command, position error), thrust accelerations NED."""
     d, d_rate = drag_along(g.drag_linear_1_s, g.drag_quadratic_1_m, v_ref, a_ref)
     d_now, _ = drag_along(g.drag_linear_1_s, g.drag_quadratic_1_m, v, a_ref)
