@@ -4,7 +4,7 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 SCENARIO ?= circle
 
-.PHONY: fly test install lint clean
+.PHONY: fly test test-page install lint clean
 
 fly: install
 	@$(BIN)/mavquad fly $(SCENARIO)
@@ -27,6 +27,9 @@ lint: install
 
 test: lint
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow"
+
+test-page: install  # the report in a real browser: Debian's package chromium
+	$(BIN)/python -m pytest tests/tools/test_report.py -m slow
 
 clean:
 	rm -rf .venv build *.egg-info

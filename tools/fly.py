@@ -65,6 +65,11 @@ def run(args: argparse.Namespace) -> int:
         flown = flight.fly(folder, flight.Pace(args.speed), max_time_s, progress.watch)
         progress.say("scoring")
         result = summary.summarise(folder, name, resolved, flown, _command(args), args.speed is None)
+        if not args.no_report and not flown.problems:
+            from tools import report
+
+            progress.say("drawing the report")
+            report.flight(folder)
     if args.json:
         print(json.dumps(result, allow_nan=False))
     else:

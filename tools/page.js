@@ -16,17 +16,18 @@
     layout.paper_bgcolor = "rgba(0,0,0,0)";
     layout.plot_bgcolor = colour("--plot");
     layout.font = { color: colour("--text"), family: "system-ui, sans-serif", size: 12 };
+    layout.modebar = { bgcolor: "rgba(0,0,0,0)", color: colour("--c5"), activecolor: colour("--c0") };
     layout.colorway = [0, 1, 2, 3, 4, 5, 6].map((i) => colour("--c" + i));
     for (const key of Object.keys(layout)) if (/^[xy]axis/.test(key)) layout[key] = { ...axis, ...layout[key] };
     if (layout.scene) for (const key of ["xaxis", "yaxis", "zaxis"]) layout.scene[key] = { ...axis, backgroundcolor: colour("--plot"), ...layout.scene[key] };
     return [resolve(spec.data), layout];
   };
-  const config = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["sendDataToCloud"] };
+  const config = { responsive: true, displaylogo: false, showSendToCloud: false };
   let linking = false;
   function link(node) {
     node.on("plotly_relayout", (change) => {
       if (linking || !node.dataset.linked) return;
-      const from = change["xaxis.range[0]"], to = change["xaxis.range[1]"];
+      const [from, to] = change["xaxis.range"] || [change["xaxis.range[0]"], change["xaxis.range[1]"]];
       const update = from !== undefined ? { "xaxis.range": [from, to] } : change["xaxis.autorange"] ? { "xaxis.autorange": true } : null;
       if (!update) return;
       linking = true;

@@ -76,10 +76,18 @@ def figure(
         data=traces,
         layout={
             "template": None,
-            "title": {"text": title, "x": 0, "xanchor": "left", "font": {"size": 14}},
+            "title": {
+                "text": title,
+                "x": 0,
+                "xanchor": "left",
+                "y": 1,
+                "yanchor": "top",
+                "pad": {"t": 6},
+                "font": {"size": 14},
+            },
             "height": height,
             "margin": {"l": 60, "r": 16, "t": 56, "b": 44},
-            "legend": {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom"},
+            "legend": {"orientation": "h", "x": 0, "y": 1, "yanchor": "bottom"},
             "showlegend": len(traces) > 1,
             "hovermode": "x unified",
             "xaxis": {"title": {"text": x}},
@@ -182,27 +190,18 @@ def path3d(
         )
     if arrows is not None:
         at, along = (np.asarray(a, float) for a in arrows)
-        traces.append(
-            go.Cone(
-                x=_f4(at[:, 1]),
-                y=_f4(at[:, 0]),
-                z=_f4(-at[:, 2]),
-                u=_f4(along[:, 1]),
-                v=_f4(along[:, 0]),
-                w=_f4(-along[:, 2]),
-                name="wind",
-                showscale=False,
-                sizemode="scaled",
-                sizeref=0.6,
-                opacity=0.7,
-                colorscale=[[0, "#8a8f98"], [1, "#8a8f98"]],
-                showlegend=True,
-            )
-        )
+        scale = 0.25 * max(float(np.ptp(at, axis=0).max()), 1.0) / max(float(np.linalg.norm(along, axis=1).max()), 1e-9)
+        gap = np.full_like(at, np.nan)
+        segments = np.stack([at - scale * along, at, gap], axis=1).reshape(-1, 3)  # blowing onto the path, the head on it
+        e, n, u = _f4(segments[:, 1]), _f4(segments[:, 0]), _f4(-segments[:, 2])
+        sizes = np.tile([0, 4, 0], len(at)).tolist()
+        look = {"line": {"color": COLOURS[5], "width": 2}, "marker": {"color": COLOURS[5], "size": sizes, "line": {"width": 0}}}
+        traces.append(go.Scatter3d(x=e, y=n, z=u, name="wind", mode="lines+markers", **look))
     axes = {
         f"{axis}axis": {"title": {"text": name}} for axis, name in zip("xyz", ("east, m", "north, m", "up, m"), strict=True)
     }
-    return figure(title, traces, height=height, hovermode="closest", scene={**axes, "aspectmode": "data"})
+    scene = {**axes, "aspectmode": "data", "domain": {"y": [0.0, 0.94]}}
+    return figure(title, traces, height=height, hovermode="closest", scene=scene, margin={"l": 0, "r": 0, "t": 56, "b": 0})
 
 
 def thin(x: np.ndarray, y: np.ndarray, points: int) -> tuple[np.ndarray, np.ndarray]:

@@ -11,21 +11,13 @@ import pytest
 
 from mavquad.errors import FlightError
 from mavquad.link.columns import Log
+from tests.tools.conftest import SHORT
 from tools import __main__ as tools_main
 from tools import flight, fly
 from tools.trace import read_trace
 
 ROOT = Path(__file__).resolve().parents[2]
-SHORT = ["hover", "--seed", "7", "--set", "path.duration_s=3", "--set", "flight.takeoff_m=2", "--no-report"]
 pytestmark = pytest.mark.xdist_group("flights")
-
-
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory):
-    """A short flight's folder and its summary."""
-    run = tmp_path_factory.mktemp("flown") / "run"
-    assert tools_main.main(["fly", *SHORT, "--run", str(run), "--json"]) == 0
-    return run, json.loads((run / "summary.json").read_text())
 
 
 def test_a_flight_goes_well_and_says_so_with_every_key(flown):
