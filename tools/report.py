@@ -162,7 +162,7 @@ def _row(r: dict[str, Any], name: str) -> list[Any]:
 
 
 # ---- figures ------------------------------------------------------------------------------------------------------------
-def _s(t_us: Array) -> Array:
+def _s(t_us: Any) -> Array:
     return 1e-6 * np.asarray(t_us, float)
 
 
