@@ -220,9 +220,9 @@ def _position(gains: Gains, state: State, sample: Position) -> State:
     if not all(map(math.isfinite, p)):
         return state
     if state.axes is None:
-        h, d = gains.horizontal, gains.vertical
+        level, vertical = gains.horizontal, gains.vertical
         v0 = v if all(map(math.isfinite, v)) else ZERO3
-        axes = (eskf.init(h, p[0], v0[0]), eskf.init(h, p[1], v0[1]), eskf.init(d, p[2], v0[2]))
+        axes = (eskf.init(level, p[0], v0[0]), eskf.init(level, p[1], v0[1]), eskf.init(vertical, p[2], v0[2]))
         return state._replace(t_us=max(state.t_us, sample.t_us), axes=axes, position_us=sample.t_us, offset_m=ZERO3)
     if sample.t_us > state.t_us:
         state = _to(gains, state, sample.t_us)

@@ -13,7 +13,7 @@ SEEDS = range(101, 106)
 
 def _ss(scenario: str, config: str, seeds=SEEDS) -> tuple[float, int]:
     """Mean ss 3-D of the flights that were not lost, and how many were lost."""
-    found = [eskf_mpc.metrics(*eskf_mpc.fly(scenario, config, seed)) for seed in seeds]
+    found = [eskf_mpc.metrics(scenario, eskf_mpc.fly(scenario, config, seed)) for seed in seeds]
     flown = [one["ss_3d"][1] for one in found if not one["lost"][1]]
     return (float(np.mean(flown)) if flown else math.nan), len(found) - len(flown)
 
@@ -69,7 +69,7 @@ def test_allocation_gives_back_what_it_was_asked_inside_the_limits():
 
 
 def test_the_estimators_f_is_the_one_the_plant_feels():
-    log, flown = eskf_mpc.fly("S1-B", "default", 101)
+    log, flown, _ = eskf_mpc.fly("S1-B", "default", 101)
     assert flown == len(log)
     f_hat, f = log[1000:, 19:25], log[1000:, 25:31]
     assert np.corrcoef(f_hat[:, 2], f[:, 2])[0, 1] > 0.9
@@ -103,6 +103,15 @@ def test_delay_without_prediction_costs_five_times_and_more():
     assert raw / predicted >= 5.0
 
 
+def test_constraints_planned_for_halve_the_overshoot():
+    def mean(config):
+        found = [eskf_mpc.metrics("S3", eskf_mpc.fly("S3", config, seed)) for seed in SEEDS]
+        assert not any(one["lost"][1] for one in found)
+        return float(np.mean([one["overshoot"][1] for one in found]))
+
+    assert mean("default") / mean("closed") <= 0.65
+
+
 def test_adrc_is_lost_in_the_noise_the_filter_bears():
     assert _ss("S1-A", "ADRC")[1] == 5
     assert _ss("S1-B", "ADRC")[1] == 0
@@ -118,8 +127,7 @@ def test_feed_forward_is_essential():
 
 
 def test_same_seed_same_flight():
-    a, _ = eskf_mpc.fly("S2-60ms-predicted", "default", 103)
-    b, _ = eskf_mpc.fly("S2-60ms-predicted", "default", 103)
+    a, b = (eskf_mpc.fly("S2-60ms-predicted", "default", 103).log for _ in range(2))
     assert a.tobytes() == b.tobytes()
 
 

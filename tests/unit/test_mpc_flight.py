@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from mavquad import airframe, quat
-from mavquad.control import mpc_flight
+from mavquad.control import lagged, mpc_flight
 from mavquad.errors import ConfigError
 from mavquad.setpoint.attitude import attitude, thrust_vector
 from mavquad.signals import NAN3, ZERO3, Demand, Estimate
@@ -18,6 +18,7 @@ from mavquad.signals import NAN3, ZERO3, Demand, Estimate
 G = 9.80665
 FRAME = airframe.load("x500")
 GAINS = mpc_flight.gains(mpc_flight.Params(), FRAME)
+LAW = GAINS.law
 HOVER = Demand(0, ZERO3, ZERO3, ZERO3, ZERO3, 0.0, 0.0)
 
 
@@ -28,7 +29,7 @@ def _estimate(t_us=1_000_000, p=ZERO3, v=ZERO3, f=ZERO3, delay_s=0.02):
 @given(seed=st.integers(0, 10**6), delay_s=st.floats(0.01, 0.3))
 def test_prediction_follows_the_differential_equation(seed, delay_s):
     rng = np.random.default_rng(seed)
-    g = GAINS._replace(drag_linear_1_s=ZERO3, drag_quadratic_1_m=ZERO3)
+    g = LAW._replace(drag_linear_1_s=ZERO3, drag_quadratic_1_m=ZERO3)
     now, n = 5.0, 60
     queue = np.zeros((mpc_flight.QUEUE, 4))
     queue[:, 0] = -1e9
@@ -44,7 +45,7 @@ def test_prediction_follows_the_differential_equation(seed, delay_s):
         x = solve_ivp(lambda t, x, u=u: np.concatenate([x[3:6], x[6:] + f, (u - x[6:]) / lag]), (low, high), x, rtol=1e-9).y[
             :, -1
         ]
-    found = mpc_flight.ahead(g, tuple(p), tuple(v), tuple(a), tuple(f), queue, now, delay_s)
+    found = lagged.ahead(g, tuple(p), tuple(v), tuple(a), tuple(f), queue, now, delay_s)
     np.testing.assert_allclose(np.concatenate(found), x, atol=1e-6)
 
 
@@ -59,19 +60,19 @@ def test_a_disturbance_is_cancelled_once():
     _, command = mpc_flight.step(
         GAINS._replace(predict=False), mpc_flight.init(GAINS), _estimate(f=f), HOVER, lambda t: HOVER, 0.008
     )
-    k = GAINS.k[2], GAINS.k[2], GAINS.k_down[2]  # level now, the lean that carries f is still to come
+    k = LAW.k[2], LAW.k[2], LAW.k_down[2]  # level now, the lean that carries f is still to come
     np.testing.assert_allclose(command.a_ned_m_s2, [-x * (1.0 + ka) for x, ka in zip(f, k, strict=True)], rtol=1e-12)
     assert command.f_cancelled_m_s2 == f
 
 
 @given(a=st.tuples(*[st.floats(-60, 60)] * 3))
 def test_what_is_sent_stays_inside_the_cone(a):
-    n, e, d = mpc_flight.limited(GAINS, a)
+    n, e, d = lagged.limited(LAW, a)
     down = G - d
-    assert GAINS.down_min_m_s2 <= down + 1e-12
-    assert down <= GAINS.down_max_m_s2 + 1e-12
-    assert math.hypot(n, e) <= down * GAINS.tan_tilt * (1.0 + 1e-12)
-    np.testing.assert_allclose(mpc_flight.limited(GAINS, (n, e, d)), (n, e, d), rtol=1e-12, atol=1e-12)
+    assert LAW.down_min_m_s2 <= down + 1e-12
+    assert down <= LAW.down_max_m_s2 + 1e-12
+    assert math.hypot(n, e) <= down * LAW.tan_tilt * (1.0 + 1e-12)
+    np.testing.assert_allclose(lagged.limited(LAW, (n, e, d)), (n, e, d), rtol=1e-12, atol=1e-12)
 
 
 def _turning(t, heading):
@@ -82,7 +83,7 @@ def _turning(t, heading):
 def test_rates_are_those_of_the_commanded_attitude(heading):
     axis, dt = NAN3, 0.001
     for i in range(1600):
-        axis, omega = mpc_flight.turning(_turning(i * dt, heading)[0], axis, heading, 0.0, dt)
+        axis, omega = lagged.turning(_turning(i * dt, heading)[0], axis, heading, 0.0, dt)
 
     def rate(t):  # of the attitude that the setpoint stage makes of the same command
         before, after = (
@@ -97,8 +98,8 @@ def test_rates_are_those_of_the_commanded_attitude(heading):
 
 def test_a_heading_that_turns_is_a_rate_about_the_vertical():
     a, axis = (1.0, -2.0, 0.5), NAN3
-    axis, _ = mpc_flight.turning(a, axis, 0.4, 0.0, 0.004)
-    _, omega = mpc_flight.turning(a, axis, 0.4, 0.3, 0.004)
+    axis, _ = lagged.turning(a, axis, 0.4, 0.0, 0.004)
+    _, omega = lagged.turning(a, axis, 0.4, 0.3, 0.004)
     q, _ = attitude(thrust_vector(a, 1.0, 1.0, 20.0), 0.4)
     np.testing.assert_allclose(quat.rotate(q, omega), (0.0, 0.0, 0.3), atol=1e-12)
 
@@ -123,7 +124,7 @@ def test_the_integral_freezes_where_the_command_is_cut():
     state = mpc_flight.init(GAINS)
     for _ in range(50):
         state, command = mpc_flight.step(GAINS, state, far, HOVER, lambda t: HOVER, 0.008)
-    assert command.a_ned_m_s2[0] == pytest.approx(GAINS.tan_tilt * G, rel=1e-6)
+    assert command.a_ned_m_s2[0] == pytest.approx(LAW.tan_tilt * G, rel=1e-6)
     assert state.integral_m_s == ZERO3
 
 
@@ -131,3 +132,30 @@ def test_the_integral_freezes_where_the_command_is_cut():
 def test_impossible_parameters_are_refused(change):
     with pytest.raises(ConfigError, match="eskf-mpc"):
         mpc_flight.Params(**change)
+
+
+def _far(gains, steps=30):
+    state, commands = mpc_flight.init(gains), []
+    for i in range(steps):
+        at = _estimate(t_us=1_000_000 + 8000 * i, p=(-6.0, 2.0, 0.5))
+        state, command = mpc_flight.step(gains, state, at, HOVER, lambda t: HOVER, 0.008)
+        commands.append(command.a_ned_m_s2)
+    return mpc_flight.diagnostics(state), np.array(commands)
+
+
+def test_a_solver_made_to_fail_leaves_the_closed_form_flagged_and_counted():
+    closed, expected = _far(mpc_flight.gains(mpc_flight.Params(constrained="off"), FRAME))
+    failing, found = _far(mpc_flight.gains(mpc_flight.Params(max_iter=1), FRAME))
+    np.testing.assert_array_equal(found, expected)
+    assert failing["qp_fallbacks"] == failing["steps"] == 30
+    assert closed["qp_fallbacks"] == 0
+    good, planned = _far(GAINS)
+    assert good["qp_solves"] > 0
+    assert good["qp_fallbacks"] == 0
+    assert not np.array_equal(planned, expected)
+
+
+def test_commands_turn_no_faster_than_the_vehicle():
+    for kind in ("off", "needed", "always"):
+        _, commands = _far(mpc_flight.gains(mpc_flight.Params(constrained=kind), FRAME))
+        assert np.abs(np.diff(commands, axis=0)).max() <= 60.0 * 0.008 + 5e-3

@@ -8,11 +8,17 @@ import argparse
 import math
 import statistics
 import sys
+from functools import lru_cache
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from tools.papers import common
 from tools.papers.common import Row
+
+if TYPE_CHECKING:
+    from mavquad.control.constrained import Design
+    from tools.papers.quad_in_wind.constrained_flight import Counts
 
 S1_CONFIGS = [
     "default",
@@ -51,14 +57,21 @@ PLAN: dict[str, list[str]] = {
     "S2-60ms-predicted-W15": ["default"],
     "S2-100ms": ["default"],
     "S2-100ms-predicted": ["default", "default-first-order-prediction"],
+    "S3": ["default", "closed", "default-integral", "closed-integral"],
 }
 SETTLED = 1000  # steps before "ss" starts: 10 s
 Job = tuple[str, str, int]
 
 
-def fly(scenario_name: str, config_name: str, seed: int) -> tuple[np.ndarray, int]:
-    """One flight: its log (steps, COLUMNS) and the steps flown before it was lost."""
-    from tools.papers.quad_in_wind import configs, loop
+class Flown(NamedTuple):
+    log: np.ndarray  # (steps, COLUMNS)
+    steps: int  # flown before it was lost
+    counts: "Counts | None"  # of the quadratic programs, where there are any
+
+
+def fly(scenario_name: str, config_name: str, seed: int) -> Flown:
+    """One flight by the names of its rows."""
+    from tools.papers.quad_in_wind import configs, constrained_flight, loop
 
     configs.pick(configs.SCENARIOS, scenario_name, "scenario")
     configs.pick(configs.CONFIGS, config_name, "config")
@@ -66,16 +79,33 @@ def fly(scenario_name: str, config_name: str, seed: int) -> tuple[np.ndarray, in
     flight = configs.flight(config, scenario)
     noise, wind = configs.disturbances(scenario, seed)
     log = np.full((scenario.steps, loop.COLUMNS), np.nan)
-    flown = loop.fly(flight, loop.loop(flight, scenario.start_ned_m, configs.YAW_START), noise, wind, log)
-    return log, flown
+    start = loop.loop(flight, scenario.start_ned_m, configs.YAW_START)
+    if config.constrained and scenario.slew_m_s3 > 0.0:
+        return Flown(log, *constrained_flight.fly(flight, start, noise, wind, log, _design()))
+    return Flown(log, loop.fly(flight, start, noise, wind, log), None)
 
 
-def metrics(log: np.ndarray, flown: int) -> dict[str, tuple[str, float]]:
+@lru_cache(maxsize=1)
+def _design() -> "Design":
+    from tools.papers.quad_in_wind import constrained_flight
+
+    return constrained_flight.design()
+
+
+def metrics(scenario: str, flown: Flown) -> dict[str, tuple[str, float]]:
     """Metric -> (unit, value); the errors of a lost flight are NaN."""
-    lost = float(flown < len(log))
-    if lost:
+    log = flown.log
+    if flown.steps < len(log):
         nan = ("m", math.nan)
         return {"lost": ("1", 1.0), **dict.fromkeys(("rmse_n", "rmse_e", "rmse_d", "ss_3d", "full_3d"), nan)}
+    extra: dict[str, tuple[str, float]] = {}
+    if scenario == "S3":
+        from tools.papers.quad_in_wind.constrained_flight import overshoot
+
+        extra["overshoot"] = ("m", overshoot(log))
+    if flown.counts is not None:
+        extra["qp_iterations_p99"] = ("1", float(np.percentile(flown.counts.iterations, 99)))
+        extra["qp_fallbacks"] = ("1", float(flown.counts.fallbacks))
     e2 = (log[:, 1:4] - log[:, 4:7]) ** 2
     ss = e2[SETTLED:].mean(axis=0)
     found = {name: ("m", float(math.sqrt(value))) for name, value in zip(("rmse_n", "rmse_e", "rmse_d"), ss, strict=True)}
@@ -87,13 +117,14 @@ def metrics(log: np.ndarray, flown: int) -> dict[str, tuple[str, float]]:
         "full_3d": ("m", float(math.sqrt(e2.sum(axis=1).mean()))),
         "f_rmse": ("m/s^2", float(np.linalg.norm(f_error[:3]))),
         "f_rmse_d": ("m/s^2", float(f_error[2])),
+        **extra,
     }
 
 
 def job_rows(job: Job) -> list[Row]:
     """The rows of one flight."""
     scenario, config, seed = job
-    found = metrics(*fly(scenario, config, seed))
+    found = metrics(scenario, fly(scenario, config, seed))
     return [common.row(scenario, config, seed, name, unit, value) for name, (unit, value) in found.items()]
 
 

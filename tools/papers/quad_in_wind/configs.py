@@ -1,6 +1,7 @@
 """Scenarios and configurations of the paper's experiments, by the names the rows carry."""
 
 import math
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -40,8 +41,8 @@ class Scenario(NamedTuple):
         return dryden(self.w20_m_s, HEIGHT_M) if self.w20_m_s > 0.0 else None
 
 
-def _same(variance: float, **changes: object) -> Scenario:
-    return Scenario(variance, variance, variance, variance)._replace(**changes)
+def _same(variance: float) -> Scenario:
+    return Scenario(variance, variance, variance, variance)
 
 
 _S2 = Scenario(1e-4, 2.5e-3, 1e-5, 1e-4, mean_wind=True, model=plant.MODEL_G, motor_lag_s=0.03, q_default=(0.03, 2.0))
@@ -50,10 +51,10 @@ SCENARIOS: dict[str, Scenario] = {
     "S1-B": _same(1e-4),
     **{f"S1-var1e-{n}": _same(10.0**-n) for n in (6, 5, 4, 3, 2, 1)},
     "S1-W5-A": Scenario(w20_m_s=5.0),
-    "S1-W5": _same(1e-4, w20_m_s=5.0),
+    "S1-W5": _same(1e-4)._replace(w20_m_s=5.0),
     "S1-W15-A": Scenario(w20_m_s=15.0),
-    "S1-W15": _same(1e-4, w20_m_s=15.0),
-    "S1-calm": _same(1e-4, w20_m_s=0.0, noise=False),
+    "S1-W15": _same(1e-4)._replace(w20_m_s=15.0),
+    "S1-calm": _same(1e-4)._replace(w20_m_s=0.0, noise=False),
     "S2": _S2,
     "S2-W15": _S2._replace(w20_m_s=15.0),
     "S2-60ms": _S2._replace(delay_steps=6),
@@ -61,7 +62,7 @@ SCENARIOS: dict[str, Scenario] = {
     "S2-60ms-predicted-W15": _S2._replace(delay_steps=6, predict=True, w20_m_s=15.0),
     "S2-100ms": _S2._replace(delay_steps=10),
     "S2-100ms-predicted": _S2._replace(delay_steps=10, predict=True),
-    "S3": _same(1e-4, steps=2000, start_ned_m=(-2.5, 1.5, -0.5), slew_m_s3=200.0),
+    "S3": _same(1e-4)._replace(steps=2000, start_ned_m=(-2.5, 1.5, -0.5), slew_m_s3=200.0),
 }
 
 
@@ -81,10 +82,11 @@ class Config(NamedTuple):
     printed_targets: bool = False
     estimator: int = loop.FILTER
     first_order_prediction: bool = False
+    constrained: bool = False  # where the scenario has limits to plan for: quadratic programs
 
 
 _TUNED = Config(preset="default", q=(0.1, 1.0), fading="none", posterior=True)
-_DEFAULT = Config(preset="default", q=None, fading="none", posterior=True, integral=False)
+_DEFAULT = Config(preset="default", q=None, fading="none", posterior=True, integral=False, constrained=True)
 CONFIGS: dict[str, Config] = {
     "default": _DEFAULT,
     "PB": Config(),
@@ -106,11 +108,14 @@ CONFIGS: dict[str, Config] = {
     "default-position-only": _DEFAULT._replace(position_only=True),
     "default-no-compensation": _DEFAULT._replace(compensate_position=False, compensate_angles=False),
     "default-first-order-prediction": _DEFAULT._replace(first_order_prediction=True),
+    "closed": _DEFAULT._replace(constrained=False),
+    "closed-integral": _DEFAULT._replace(constrained=False, integral=True),
+    "default-integral": _DEFAULT._replace(integral=True),
     "default-integral-only": _DEFAULT._replace(compensate_position=False, integral=True),
 }
 
 
-def pick(table: dict[str, object], name: str, kind: str) -> None:
+def pick(table: Mapping[str, object], name: str, kind: str) -> None:
     if name not in table:
         raise ConfigError(f'no {kind} "{name}"; known: {", ".join(table)}')
 

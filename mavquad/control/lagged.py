@@ -1,0 +1,205 @@
+"""The flown MPC's model and law as kernels: a thrust acceleration that follows its command with a lag, drag, limits, rates.
+
+States of an axis are p, v and the thrust acceleration a with a' = (u - a)/tau; `mpc_flight.py` makes the gains and runs the steps.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from mavquad import quat
+from mavquad.jit import kernel
+from mavquad.signals import Quat, Vec3
+
+G_M_S2 = 9.80665
+RATE_FILTER_S = 0.04
+
+
+class Law(NamedTuple):
+    """What the kernels need."""
+
+    k: Vec3  # horizontal: on position, velocity, acceleration
+    k_down: Vec3
+    k_soft: Vec3  # for a delay beyond what is predicted
+    lag_s: float
+    lag_down_s: float
+    jerk: float
+    compensate: float  # 0 or 1
+    drag_linear_1_s: Vec3
+    drag_quadratic_1_m: Vec3
+    drag: float
+    integral: float
+    tan_tilt: float
+    down_min_m_s2: float
+    down_max_m_s2: float
+    slew_m_s3: float
+
+
+@kernel
+def drag_along(linear: Vec3, quadratic: Vec3, v: Vec3, a: Vec3) -> tuple[Vec3, Vec3]:
+    """Acceleration by drag at the velocity v, and its rate of change under the acceleration a."""
+    speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    along = (v[0] * a[0] + v[1] * a[1] + v[2] * a[2]) / speed if speed > 1e-6 else 0.0
+    c0, c1, c2 = linear[0] + quadratic[0] * speed, linear[1] + quadratic[1] * speed, linear[2] + quadratic[2] * speed
+    d = (-c0 * v[0], -c1 * v[1], -c2 * v[2])
+    rate = (
+        -c0 * a[0] - quadratic[0] * along * v[0],
+        -c1 * a[1] - quadratic[1] * along * v[1],
+        -c2 * a[2] - quadratic[2] * along * v[2],
+    )
+    return d, rate
+
+
+@kernel
+def ahead(
+    g: Law, p: Vec3, v: Vec3, a: Vec3, rest: Vec3, queue: np.ndarray, now_s: float, delay_s: float
+) -> tuple[Vec3, Vec3, Vec3]:
+    """(p, v, a) after delay_s: each command acts delay_s after its stamp, the acceleration follows it with the lag.
+
+    rest: disturbance beyond the airframe's drag, constant on the way. Exact between the instants at which commands take over,
+    but for the drag, which is taken at the beginning of each piece.
+    """
+    last = len(queue) - 1
+    i = last
+    while i > 0 and queue[i, 0] > now_s - delay_s:
+        i -= 1
+    at = 0.0  # seconds from now
+    while at < delay_s:
+        until = delay_s
+        if i < last:
+            until = min(delay_s, queue[i + 1, 0] + delay_s - now_s)
+        h = until - at
+        if h > 0.0:
+            d, _ = drag_along(g.drag_linear_1_s, g.drag_quadratic_1_m, v, (0.0, 0.0, 0.0))
+            eh, ed = math.exp(-h / g.lag_s), math.exp(-h / g.lag_down_s)
+            u = (a[0], a[1], a[2])
+            if queue[i, 0] > -1e8:
+                u = (queue[i, 1], queue[i, 2], queue[i, 3])
+            pn, vn, an = _piece(p[0], v[0], a[0], u[0], d[0] + rest[0], h, g.lag_s, eh)
+            pe, ve, ae = _piece(p[1], v[1], a[1], u[1], d[1] + rest[1], h, g.lag_s, eh)
+            pd, vd, ad = _piece(p[2], v[2], a[2], u[2], d[2] + rest[2], h, g.lag_down_s, ed)
+            p, v, a = (pn, pe, pd), (vn, ve, vd), (an, ae, ad)
+        at = until
+        if i < last:
+            i += 1
+        elif at < delay_s:
+            break
+    return p, v, a
+
+
+@kernel
+def _piece(p, v, a, u, f, h, lag_s, keep):
+    """p, v, a after h of constant u and f: v' = a + f, a' = (u - a)/lag; keep = exp(-h/lag)."""
+    gap = a - u
+    fall = lag_s * (1.0 - keep)  # integral of exp(-t/lag)
+    return (
+        p + h * v + 0.5 * h * h * (u + f) + gap * lag_s * (h - fall),
+        v + h * (u + f) + gap * fall,
+        u + keep * gap,
+    )
+
+
+@kernel
+def limited(g: Law, u: Vec3) -> Vec3:
+    """Vertical first, then the horizontal part into the cone: the acceleration of a thrust vector that the vehicle may have."""
+    down = min(g.down_max_m_s2, max(g.down_min_m_s2, G_M_S2 - u[2]))
+    north, east = u[0], u[1]
+    size, most = math.sqrt(north * north + east * east), down * g.tan_tilt
+    if size > most:
+        north, east = north * most / size, east * most / size
+    return (north, east, G_M_S2 - down)
+
+
+@kernel
+def slewed(u: Vec3, last: Vec3, most: float) -> Vec3:
+    """Each axis at most `most` from the last command; NaN: there is none."""
+    if not math.isfinite(last[0]):
+        return u
+    return (
+        min(last[0] + most, max(last[0] - most, u[0])),
+        min(last[1] + most, max(last[1] - most, u[1])),
+        min(last[2] + most, max(last[2] - most, u[2])),
+    )
+
+
+@kernel
+def path_part(g: Law, v: Vec3, rest: Vec3, v_ref: Vec3, a_ref: Vec3, j_ref: Vec3) -> tuple[Vec3, Vec3]:
+    """(thrust acceleration the path needs, command that brings it about with the lag)."""
+    d, rate = drag_along(g.drag_linear_1_s, g.drag_quadratic_1_m, v_ref, a_ref)
+    felt, _ = drag_along(g.drag_linear_1_s, g.drag_quadratic_1_m, v, a_ref)
+    # drag along the path fed forward (share 1), or what is felt now cancelled (share 0)
+    s, c = g.drag, (1.0 - g.drag) * g.compensate
+    n = a_ref[0] - s * d[0] - c * felt[0] - g.compensate * rest[0]
+    e = a_ref[1] - s * d[1] - c * felt[1] - g.compensate * rest[1]
+    w = a_ref[2] - s * d[2] - c * felt[2] - g.compensate * rest[2]
+    k, kd = g.jerk * g.lag_s, g.jerk * g.lag_down_s
+    return (n, e, w), (n + k * (j_ref[0] - s * rate[0]), e + k * (j_ref[1] - s * rate[1]), w + kd * (j_ref[2] - s * rate[2]))
+
+
+@kernel
+def feedback(k: Vec3, k_down: Vec3, e_p: Vec3, e_v: Vec3, e_a: Vec3) -> Vec3:
+    """-K e on every axis."""
+    return (
+        -(k[0] * e_p[0] + k[1] * e_v[0] + k[2] * e_a[0]),
+        -(k[0] * e_p[1] + k[1] * e_v[1] + k[2] * e_a[1]),
+        -(k_down[0] * e_p[2] + k_down[1] * e_v[2] + k_down[2] * e_a[2]),
+    )
+
+
+@kernel
+def grown(integral: Vec3, e: Vec3, wanted: Vec3, given: Vec3, dt_s: float) -> Vec3:
+    """The integral of the position error [m s], frozen on an axis that is cut and would be driven further, clamped."""
+    out = (0.0, 0.0, 0.0)
+    for i in range(3):
+        x = integral[i]
+        if not (abs(wanted[i] - given[i]) > 1e-9 and e[i] * (wanted[i] - given[i]) < 0.0):
+            x = min(2.0, max(-2.0, x + dt_s * e[i]))
+        if i == 0:
+            out = (x, out[1], out[2])
+        elif i == 1:
+            out = (out[0], x, out[2])
+        else:
+            out = (out[0], out[1], x)
+    return out
+
+
+@kernel
+def turning(a: Vec3, axis: Vec3, yaw_rad: float, yaw_rate_rad_s: float, dt_s: float) -> tuple[Vec3, Vec3]:
+    """(filtered axis, body rates): how fast the thrust axis of the command turns, through a 40 ms filter."""
+    x, y, z = -a[0], -a[1], G_M_S2 - a[2]
+    size = math.sqrt(x * x + y * y + z * z)
+    n = (x / size, y / size, z / size)
+    if not math.isfinite(axis[0]):
+        axis = n
+    keep = math.exp(-dt_s / RATE_FILTER_S)
+    new = (n[0] + keep * (axis[0] - n[0]), n[1] + keep * (axis[1] - n[1]), n[2] + keep * (axis[2] - n[2]))
+    dx, dy, dz = (new[0] - axis[0]) / dt_s, (new[1] - axis[1]) / dt_s, (new[2] - axis[2]) / dt_s
+    # world rate n x n', plus the heading's
+    wx, wy, wz = n[1] * dz - n[2] * dy, n[2] * dx - n[0] * dz, n[0] * dy - n[1] * dx + yaw_rate_rad_s
+    # body axes: z along n, x in the vertical plane of the heading
+    cy, sy = math.cos(yaw_rad), math.sin(yaw_rad)
+    bx, by, bz = cy * n[2], sy * n[2], -(cy * n[0] + sy * n[1])
+    size = math.sqrt(bx * bx + by * by + bz * bz)
+    bx, by, bz = bx / size, by / size, bz / size
+    ex, ey, ez = n[1] * bz - n[2] * by, n[2] * bx - n[0] * bz, n[0] * by - n[1] * bx
+    return new, (wx * bx + wy * by + wz * bz, wx * ex + wy * ey + wz * ez, wx * n[0] + wy * n[1] + wz * n[2])
+
+
+@kernel
+def thrust_acceleration(q: Quat, thrust_m_s2: float) -> Vec3:
+    """g e3 - T R e3."""
+    up = quat.rotate(q, (0.0, 0.0, thrust_m_s2))
+    return (-up[0], -up[1], G_M_S2 - up[2])
+
+
+@kernel
+def between(knots: np.ndarray, stages: int, every: int) -> np.ndarray:
+    """Linear interpolation of the rows of `knots`, `every` stages apart."""
+    out = np.empty((stages, 3))
+    for j in range(stages):
+        i = j // every
+        w = (j - i * every) / every
+        for c in range(3):
+            out[j, c] = (1.0 - w) * knots[i, c] + w * knots[i + 1, c]
+    return out
