@@ -106,7 +106,9 @@ def _logs() -> None:
         with tlog.Writer(path) as writer:
             for i in range(3):
                 writer.write(i, wire.encode("HEARTBEAT", (2, 12, 0, 0, 4, 3), seq=i, system=1, component=1))
-        Log(path).columns("HEARTBEAT")
+        log = Log(path)
+        log.columns("HEARTBEAT")
+        log.everything()
 
 
 def _stamp(label: str) -> Path:
