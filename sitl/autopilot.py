@@ -5,6 +5,7 @@ record to the messages that arrive. Times are vehicle time in microseconds; `tic
 """
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -33,7 +34,7 @@ class Home(NamedTuple):
     q_wxyz: tuple[float, ...]
 
 
-class Autopilot:
+class Autopilot(ABC):
     """Base of the personalities. `say(severity, text)` sends a STATUSTEXT to everybody."""
 
     kind = 0  # MAV_AUTOPILOT
@@ -41,10 +42,13 @@ class Autopilot:
     version = 0
     rate_limit_hz = 1000.0  # more is refused
     rate_denied = FAILED  # a rate for a message that is not there
+    refusal = TEMPORARILY_REJECTED  # of arming and disarming
+    timesync_us = 0  # how often it asks for the time unless in lockstep; 0 never
 
     def __init__(self, vehicle: Vehicle, params: Table, say: Callable[[int, str], None]) -> None:
         self.vehicle, self.params, self.say = vehicle, params, say
         self.boot_us = self.t_us = vehicle.t_us
+        self.heard_us: dict[int, int] = {}  # when each system was last heard
         self.armed = False
         self.landed = True
         self.flown = False  # has been in the air since it was armed
@@ -63,70 +67,71 @@ class Autopilot:
         self.apply_params()
 
     # ---- what a personality adds --------------------------------------------------------------------------------------
+    @abstractmethod
     def apply_params(self) -> None:
         """Parameters into the constants of the loops."""
-        raise NotImplementedError
 
+    @abstractmethod
     def heartbeat(self) -> tuple[int, ...]:
         """Fields of HEARTBEAT."""
-        raise NotImplementedError
 
+    @abstractmethod
     def can_arm(self) -> str:
         """Why arming is refused, or nothing."""
-        raise NotImplementedError
 
+    @abstractmethod
     def set_mode(self, custom: int, sub: int) -> int:
         """DO_SET_MODE: a MAV_RESULT."""
-        raise NotImplementedError
 
+    @abstractmethod
     def takeoff(self, altitude: float) -> int:
         """NAV_TAKEOFF with its param7: a MAV_RESULT."""
-        raise NotImplementedError
 
+    @abstractmethod
     def land(self) -> int:
         """NAV_LAND: a MAV_RESULT."""
-        raise NotImplementedError
 
+    @abstractmethod
     def go_home(self) -> int:
         """NAV_RETURN_TO_LAUNCH: a MAV_RESULT."""
-        raise NotImplementedError
 
+    @abstractmethod
     def attitude_target(self, m: Any) -> None:
         """SET_ATTITUDE_TARGET."""
-        raise NotImplementedError
 
+    @abstractmethod
     def position_target(self, m: Any) -> None:
         """SET_POSITION_TARGET_LOCAL_NED."""
-        raise NotImplementedError
 
+    @abstractmethod
     def mode_tick(self) -> None:
         """Failsafes and mode changes of the personality, each 20 ms."""
-        raise NotImplementedError
 
+    @abstractmethod
     def landed_or_arrived(self, task: str) -> None:
         """A task has come to its end (`takeoff` reached its height, `land` and `return` disarmed)."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def engaged(self) -> bool:
         """Somebody outside is flying by setpoints."""
-        raise NotImplementedError
 
     @property
     def has_origin(self) -> bool:
         """The estimator knows where it is."""
         return True
 
+    @abstractmethod
     def split_mode(self, custom_mode: int) -> tuple[int, int]:
         """HEARTBEAT's custom_mode as the two numbers of `set_mode`."""
-        raise NotImplementedError
 
     def data_stream(self, stream: int) -> tuple[str, ...]:
         """The messages of an old REQUEST_DATA_STREAM; none where it is not honoured."""
         return ()
 
-    def heard(self, system: int, component: int, m: Any) -> None:
+    def heard(self, system: int, component: int) -> None:
         """A HEARTBEAT of somebody else."""
+        self.heard_us[system] = self.vehicle.t_us
 
     def attitude_echo(self) -> tuple[Any, ...]:
         """Fields of ATTITUDE_TARGET behind the stamp: what the attitude loop is after, as it was asked for."""
@@ -142,7 +147,7 @@ class Autopilot:
         reason = "" if force else self.can_arm()
         if reason:
             self.say(CRITICAL, f"Arming denied: {reason}")
-            return TEMPORARILY_REJECTED
+            return self.refusal
         self.armed, self.flown, self._armed_us = True, False, self.t_us
         p = self.position()
         self.home = Home((p[0], p[1], p[2]), tuple(self.vehicle.state["ahrs_q_wxyz"].tolist()))
@@ -154,7 +159,7 @@ class Autopilot:
         """A MAV_RESULT; in the air only by force."""
         if self.armed and not self.landed and not force:
             self.say(CRITICAL, "Disarming denied: not landed")
-            return TEMPORARILY_REJECTED
+            return self.refusal
         if self.armed:
             self.say(INFO, f"Disarmed by {why}")
             self.ended_us = self.t_us if self.flown else self.ended_us
@@ -229,17 +234,17 @@ class Autopilot:
         """Setpoints come from outside."""
         self.task = "external"
 
+    @abstractmethod
     def climb_speed(self) -> float:
         """Of a take-off, m/s."""
-        raise NotImplementedError
 
+    @abstractmethod
     def sink_speed(self, height_m: float) -> float:
         """Of a landing at a height above home, m/s."""
-        raise NotImplementedError
 
+    @abstractmethod
     def disarm_after_s(self) -> float:
         """How long it stands before it disarms by itself."""
-        raise NotImplementedError
 
     # ---- inside -------------------------------------------------------------------------------------------------------
     def _stop(self) -> None:

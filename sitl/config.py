@@ -84,14 +84,16 @@ class Noise(config.Section, frozen=True):
     mocap_delay_ms: int = 0
     gyro_bias_rad_s: Vec3 = (0.0, 0.0, 0.0)
     accel_bias_m_s2: Vec3 = (0.0, 0.0, 0.0)
-    velocity_bias_m_s: Vec3 = (0.0, 0.0, 0.0)
+    velocity_bias_m_s: Vec3 | None = None  # None: as the personality has it
     position_delay_ms: int | None = None  # None: as the personality has it
 
     def __post_init__(self) -> None:
         for name in ("position_m", "velocity_m_s", "attitude_deg", "gyro_rad_s", "accel_m_s2", "mocap_deg"):
             _bounds(f"noise.{name}", getattr(self, name), 0.0, 100.0, "")
-        if self.mocap_rate_hz not in (1, 2, 5, 10, 20, 25, 50, 100, 125, 200, 250, 500):
-            raise ConfigError(f"noise.mocap_rate_hz = {self.mocap_rate_hz}: expected a divisor of 1000 from 1 to 500 Hz")
+        if self.mocap_rate_hz not in (1, 2, 5, 10, 20, 25, 50, 100, 125, 250, 500):
+            raise ConfigError(
+                f"noise.mocap_rate_hz = {self.mocap_rate_hz}: expected 1, 2, 5, 10, 20, 25, 50, 100, 125, 250 or 500 Hz"
+            )
         for name in ("mocap_delay_ms", "position_delay_ms"):
             _bounds(f"noise.{name}", getattr(self, name) or 0, 0, 200, "ms")
 
@@ -167,7 +169,7 @@ class Sitl(config.Section, frozen=True):
     overrides: list[str] = field(
         default_factory=list
     )  # what the true vehicle has against its file; the autopilot is tuned for the file
-    loop_hz: Literal[500, 1000] = 500
+    loop_hz: Literal[500, 1000] | None = None  # None: 500 (px4) or 1000 (ardupilot, whose 200 Hz divide only this)
     control_period_ms: int | None = None  # None: 8 (px4) or 10 (ardupilot)
     attitude_source: Literal["ahrs", "mocap", "both"] = "ahrs"
     system: int = 1
@@ -183,12 +185,17 @@ class Sitl(config.Section, frozen=True):
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**32:
             raise ConfigError(f"seed = {self.seed}: expected 0 to {2**32 - 1}")
-        if not 1 <= self.period_ms <= 100 or self.period_ms % (1000 // self.loop_hz):
+        if not 1 <= self.period_ms <= 100 or self.period_ms % (1000 // self.rate_hz):
             raise ConfigError(
-                f"control_period_ms = {self.period_ms}: expected 1 to 100 ms, a multiple of the loop's {1000 // self.loop_hz} ms"
+                f"control_period_ms = {self.period_ms}: expected 1 to 100 ms, a multiple of the loop's {1000 // self.rate_hz} ms"
             )
         for name in ("system", "component"):
             _bounds(name, getattr(self, name), 1, 255, "")
+
+    @property
+    def rate_hz(self) -> int:
+        """How often plant and loops run."""
+        return self.loop_hz or (500 if self.personality == "px4" else 1000)
 
     @property
     def period_ms(self) -> int:

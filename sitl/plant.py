@@ -70,7 +70,7 @@ def step(s, c):
     dt = c.dt_s
     v = (s.v_ned_m_s[0], s.v_ned_m_s[1], s.v_ned_m_s[2])
     w = (s.omega_rad_s[0], s.omega_rad_s[1], s.omega_rad_s[2])
-    R = (s.R[0], s.R[1], s.R[2], s.R[3], s.R[4], s.R[5], s.R[6], s.R[7], s.R[8])
+    R = rotation.matrix(s.R)
     wind = (s.wind_ned_m_s[0], s.wind_ned_m_s[1], s.wind_ned_m_s[2])
     T = (s.thrust_n[0], s.thrust_n[1], s.thrust_n[2], s.thrust_n[3])
     keep = math.exp(-0.5 * dt / c.lag_s) if c.lag_s > 0.0 else 0.0

@@ -15,8 +15,8 @@ from scipy import optimize
 
 from mavquad.errors import MavquadError
 from sitl import config, rotation
+from sitl.simulation import Simulation
 from sitl.state import ATTITUDE
-from sitl.vehicle import Vehicle
 
 _SETTLE_S, _WATCH_S = 2.0, 0.8
 
@@ -40,21 +40,22 @@ def step_answers(sitl: config.Sitl, step_rad: float) -> tuple[np.ndarray, np.nda
     rows = []
     for axis in (0, 1):
         for sign in (1.0, -1.0):
-            vehicle = Vehicle(sitl)
+            simulation = Simulation(sitl)  # its autopilot sets the loops' gains
+            vehicle = simulation.vehicle
             vehicle.state["p_ned_m"], vehicle.state["grounded"] = (0.0, 0.0, -100.0), 0
             setpoint = vehicle.setpoint
             setpoint["kind"], setpoint["R"], setpoint["thrust"] = ATTITUDE, rotation.IDENTITY, vehicle.constants["hover_thrust"]
-            vehicle.run(round(_SETTLE_S * sitl.loop_hz))
+            vehicle.run(round(_SETTLE_S * sitl.rate_hz))
             angles = [0.0, 0.0, 0.0]
             angles[axis] = sign * step_rad
             setpoint["R"] = rotation.from_euler(*angles)
             row = []
-            for _ in range(round(_WATCH_S * sitl.loop_hz)):
+            for _ in range(round(_WATCH_S * sitl.rate_hz)):
                 vehicle.run(1)
                 row.append(rotation.to_euler(tuple(vehicle.state["R"].tolist()))[axis] / (sign * step_rad))
             rows.append(row)
     answers = np.array(rows)
-    return np.arange(1, answers.shape[1] + 1) / sitl.loop_hz, answers
+    return np.arange(1, answers.shape[1] + 1) / sitl.rate_hz, answers
 
 
 def second_order(t_s: np.ndarray, wn: float, zeta: float, delay_s: float) -> np.ndarray:

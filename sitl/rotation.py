@@ -12,6 +12,12 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 @kernel
+def matrix(a):
+    """Nine floats of an array as a tuple."""
+    return (a[0], a[1], a[2], a[3], a[4], a[5], a[6], a[7], a[8])
+
+
+@kernel
 def apply(R, v):
     """R v."""
     return (

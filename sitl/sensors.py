@@ -26,7 +26,7 @@ GYRO, ACCEL, DRIFT, POSITION, VELOCITY, MOCAP, AIR, COLUMNS = 0, 3, 6, 9, 12, 15
 def sense(s, c, n):
     """Sample every sensor at the vehicle's present instant; n (25,) normals of this step."""
     dt = c.dt_s
-    R = (s.R[0], s.R[1], s.R[2], s.R[3], s.R[4], s.R[5], s.R[6], s.R[7], s.R[8])
+    R = rotation.matrix(s.R)
     felt = apply_t(R, (s.accel_ned_m_s2[0], s.accel_ned_m_s2[1], s.accel_ned_m_s2[2] - GRAVITY_M_S2))
     for i in range(3):
         s.gyro_rad_s[i] = s.omega_rad_s[i] + c.gyro_bias[i] + c.gyro_sigma * n[GYRO + i]
@@ -55,7 +55,7 @@ def sense(s, c, n):
 
 @kernel
 def _ahrs(s, c, R, dt):
-    A = (s.ahrs_R[0], s.ahrs_R[1], s.ahrs_R[2], s.ahrs_R[3], s.ahrs_R[4], s.ahrs_R[5], s.ahrs_R[6], s.ahrs_R[7], s.ahrs_R[8])
+    A = rotation.matrix(s.ahrs_R)
     reference = rotation.mul(R, rotation.exp((s.drift_rad[0], s.drift_rad[1], s.drift_rad[2])))
     E = rotation.mul_t(A, reference)
     e = (0.5 * (E[7] - E[5]), 0.5 * (E[2] - E[6]), 0.5 * (E[3] - E[1]))
@@ -97,8 +97,7 @@ def _remember(s, R):
 @kernel
 def _mocap(s, c, n):
     then = max(0, s.step - c.mocap_delay) % RING
-    P = s.past_R[then]
-    R = (P[0], P[1], P[2], P[3], P[4], P[5], P[6], P[7], P[8])
+    R = rotation.matrix(s.past_R[then])
     error = (c.mocap_sigma * n[MOCAP], c.mocap_sigma * n[MOCAP + 1], c.mocap_sigma * n[MOCAP + 2])
     q = rotation.to_quaternion(rotation.mul(R, rotation.exp(error)))
     for i in range(4):

@@ -155,7 +155,7 @@ class Services:
             self._sim.send(link, "PING", (m.time_usec, m.seq, frame.system, frame.component))
 
     def _heartbeat(self, link: Link, frame: Frame, m: Any) -> None:
-        self._sim.autopilot.heard(frame.system, frame.component, m)
+        self._sim.autopilot.heard(frame.system, frame.component)
 
     # ---- parameters ---------------------------------------------------------------------------------------------------
     def _param_list(self, link: Link, frame: Frame, m: Any) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 from mavquad import wire
 from mavquad.errors import WireError
 from mavquad.wire import Frame
-from sitl import config, links, px4, telemetry
+from sitl import ardupilot, config, links, px4, telemetry
 from sitl.autopilot import TICK_US, Autopilot, check_airframe
 from sitl.links import NEVER, Link, Stream
 from sitl.params import Table
@@ -39,7 +39,8 @@ class Simulation:
         self.partner: Link | None = None  # of the lockstep
         self.periods = self.engaged_periods = self.misses = 0
         self.sick: set[str] = set()  # sensors with a fault
-        self.gyro_name = "gyro_rad_s"
+        # ArduPilot sends its gyro behind its low-pass
+        self.gyro_name = "gyro_rad_s" if sitl.personality == "px4" else "rates_rad_s"
         self.mocap_age_us = 1000 * sitl.noise.mocap_delay_ms
         self._record = record
         self._records: list[tuple[int, bytes]] = []
@@ -156,6 +157,7 @@ class Simulation:
                 self._tick_us += TICK_US
                 self._services.tick()
                 self.autopilot.tick(now_us)
+                self._ask_time(now_us)
             if now_us >= self._stream_us:
                 self._emit(now_us)
 
@@ -176,10 +178,14 @@ class Simulation:
     # ---- inside -------------------------------------------------------------------------------------------------------
     def _boot(self) -> Autopilot:
         tuned, _ = config.vehicles(self.config)
-        return px4.Px4(self.vehicle, Table(px4.defaults(tuned), self.config.params, bytewise=True), self.say)
+        if self.config.personality == "px4":
+            return px4.Px4(self.vehicle, Table(px4.defaults(tuned), self.config.params, bytewise=True), self.say)
+        table = Table(ardupilot.defaults(tuned), self.config.params, bytewise=False)
+        return ardupilot.ArduPilot(self.vehicle, table, self.say)
 
-    def _offered(self) -> tuple[str, ...]:
-        return telemetry.ORDER
+    def _offered(self) -> set[str]:
+        other = {"px4": "EKF_STATUS_REPORT", "ardupilot": "ESTIMATOR_STATUS"}[self.config.personality]
+        return set(telemetry.ORDER) - {other}
 
     def _default_hz(self, name: str) -> float:
         source = self.config.attitude_source
@@ -187,7 +193,7 @@ class Simulation:
             return float(self.config.noise.mocap_rate_hz) if source != "ahrs" else 0.0
         if name in ("ATTITUDE", "ATTITUDE_QUATERNION") and source == "mocap":
             return 0.0
-        return px4.STREAMS_HZ.get(name, 0.0)
+        return {"px4": px4, "ardupilot": ardupilot}[self.config.personality].STREAMS_HZ.get(name, 0.0)
 
     def _emit(self, t_us: int) -> None:
         next_us = NEVER
@@ -264,6 +270,12 @@ class Simulation:
             heard = any(s == system and component in (0, c) for s, c in link.speakers)
             if link is not source and (system == 0 or heard):
                 link.down.put(self.t_us, frame.raw)
+
+    def _ask_time(self, t_us: int) -> None:
+        every_us = self.autopilot.timesync_us
+        if every_us and not self.lockstep and t_us % every_us < TICK_US:
+            for link in self.links:
+                self.send(link, "TIMESYNC", (0, 1000 * (t_us - self.autopilot.boot_us)))
 
     def _write_truth(self) -> None:
         for name, fields in zip(("ODOMETRY", "DEBUG_FLOAT_ARRAY"), telemetry.truth(self), strict=True):

@@ -11,7 +11,8 @@ import numpy as np
 from mavquad.jit import COMPILED
 
 OFF, IDLE, RATES, ATTITUDE, POSITION = 0, 1, 2, 3, 4  # what the inner loops are asked to do (SETPOINT.kind)
-CLIMB = 5  # ATTITUDE, with a climb rate in place of thrust
+CLIMB = 5  # ATTITUDE, with a climb rate (in v_ned_m_s) in place of thrust
+PX4, ARDUPILOT = 0, 1  # CONSTANTS.personality
 
 VEHICLE = np.dtype(
     [
@@ -54,12 +55,17 @@ VEHICLE = np.dtype(
         # loops
         ("velocity_integral", "f8", 3),
         ("rate_integral", "f8", 3),
-        ("target_R", "f8", 9),
+        ("aim_p", "f8", 3),  # what the position loop is after
+        ("aim_v", "f8", 3),
+        ("aim_a", "f8", 3),
+        ("wanted_R", "f8", 9),  # the attitude asked for
+        ("target_R", "f8", 9),  # the one that the loop is after
         ("target_rates_rad_s", "f8", 3),
+        ("target_accel_rad_s2", "f8", 3),
         ("shaped_R", "f8", 9),  # ArduPilot's target after input shaping
         ("shaped_rates_rad_s", "f8", 3),
-        ("thrust", "f8"),  # collective 0..1
-        ("force_m_s2", "f8", 3),  # wanted by the position loop
+        ("thrust", "f8"),  # collective 0..1 as it was asked for
+        ("lift", "f8"),  # collective 0..1 as it is given to the rotors
         ("outputs", "f8", 4),  # of each rotor, 0..1 of its full thrust
         ("pwm_us", "i8", 4),
     ]
@@ -70,7 +76,7 @@ SETPOINT = np.dtype(
         ("kind", "i8"),
         ("R", "f8", 9),
         ("rates_rad_s", "f8", 3),
-        ("thrust", "f8"),  # 0..1; for CLIMB m/s upwards
+        ("thrust", "f8"),  # 0..1
         ("p_ned_m", "f8", 3),
         ("v_ned_m_s", "f8", 3),
         ("a_ned_m_s2", "f8", 3),
@@ -148,6 +154,8 @@ CONSTANTS = np.dtype(
         ("tilt_max_rad", "f8"),
         ("input_tc_s", "f8"),
         ("shaping_accel", "f8", 3),
+        ("aim_accel", "f8", 2),  # horizontal, vertical
+        ("aim_jerk", "f8"),
     ]
 )
 

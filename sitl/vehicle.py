@@ -1,13 +1,14 @@
 """The vehicle with its sensors and inner loops: one compiled call from one sampling instant to the next."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from mavquad.airframe import Airframe
 from mavquad.jit import kernel
 from sitl import config, loops, plant, rotation, rotors, sensors, wind
-from sitl.state import CONSTANTS, SETPOINT, VEHICLE, Record
+from sitl.state import ARDUPILOT, CONSTANTS, PX4, SETPOINT, VEHICLE, Record
 
 _BLOCK = 4096  # steps drawn at once
 _GENERATORS = (  # one seeded generator per sensor, each with its columns of the block
@@ -18,7 +19,24 @@ _GENERATORS = (  # one seeded generator per sensor, each with its columns of the
     (sensors.MOCAP, sensors.AIR),
     (sensors.AIR, sensors.COLUMNS),
 )
-_GYRO_CUTOFF_HZ = {"px4": 60.0, "ardupilot": 20.0}
+
+
+class _Tuning(NamedTuple):
+    """What the inner loops and sensors of a personality differ in."""
+
+    number: int
+    gyro_cutoff_hz: float
+    rate_p: float
+    rate_i: float
+    rate_d: float
+    velocity_bias_m_s: tuple[float, float, float]  # what its velocity is off the slope of its position
+    position_delay_ms: tuple[int, int]  # constant within a run, drawn between these
+
+
+_TUNING = {
+    "px4": _Tuning(PX4, 60.0, 28.0, 15.0, 0.3, (0.0, 0.0, 0.0), (0, 0)),
+    "ardupilot": _Tuning(ARDUPILOT, 20.0, 22.0, 5.0, 0.5, (0.015, -0.012, 0.006), (8, 50)),
+}
 
 
 @kernel
@@ -59,7 +77,7 @@ class Vehicle:
 
     def __init__(self, sitl: config.Sitl) -> None:
         tuned, true = config.vehicles(sitl)
-        self.dt_us = 1_000_000 // sitl.loop_hz
+        self.dt_us = 1_000_000 // sitl.rate_hz
         self.t_us = 0  # vehicle time
         self.constants = Record(CONSTANTS)
         self.setpoint = Record(SETPOINT)
@@ -111,7 +129,7 @@ class Vehicle:
         c["wind_to"] = math.cos(towards), math.sin(towards)
         c["mean_wind_m_s"] = w.mean_m_s * math.cos(towards), w.mean_m_s * math.sin(towards)
         c["profile"], c["turbulent"] = w.profile, w.w20_m_s > 0.0
-        c["air_every"] = round(wind.SAMPLE_S * sitl.loop_hz)
+        c["air_every"] = round(wind.SAMPLE_S * sitl.rate_hz)
         c["rotor_model"] = rotors.MODELS[w.rotor_model]
         c["air_density"], c["rotor_disk_m2"] = w.air_density_kg_m3, w.rotor_disk_m2
         if w.w20_m_s > 0.0:
@@ -121,39 +139,45 @@ class Vehicle:
             self.state["turbulence"] = d.P0 @ np.random.default_rng([sitl.seed, 0]).standard_normal(7)
 
     def _fill_sensors(self, sitl: config.Sitl) -> None:
-        c, n, dt = self.constants, sitl.noise, 1.0 / sitl.loop_hz
+        c, n, dt = self.constants, sitl.noise, 1.0 / sitl.rate_hz
         c["gyro_sigma"], c["accel_sigma"] = n.gyro_rad_s, n.accel_m_s2
-        c["gyro_bias"], c["accel_bias"], c["velocity_bias"] = n.gyro_bias_rad_s, n.accel_bias_m_s2, n.velocity_bias_m_s
+        tuning = _TUNING[sitl.personality]
+        c["gyro_bias"], c["accel_bias"] = n.gyro_bias_rad_s, n.accel_bias_m_s2
+        c["velocity_bias"] = tuning.velocity_bias_m_s if n.velocity_bias_m_s is None else n.velocity_bias_m_s
         keep = math.exp(-dt / sensors.DRIFT_S)
         c["drift_keep"], c["drift_draw"] = keep, math.radians(n.attitude_deg) * math.sqrt(1.0 - keep * keep)
         self.state["drift_rad"] = math.radians(n.attitude_deg) * np.random.default_rng([sitl.seed, 99]).standard_normal(3)
         c["position_sigma"], c["velocity_sigma"] = n.position_m, n.velocity_m_s
         c["altitude_m"] = config.ORIGIN[2]
-        c["nav_every"] = sitl.loop_hz // 50
-        delay = n.position_delay_ms if n.position_delay_ms is not None else {"px4": 0, "ardupilot": 20}[sitl.personality]
-        c["nav_delay"] = round(1e-3 * delay * sitl.loop_hz)
+        c["nav_every"] = sitl.rate_hz // 50
+        low, high = tuning.position_delay_ms
+        drawn = int(np.random.default_rng([sitl.seed, 97]).integers(low, high + 1))
+        c["nav_delay"] = round(1e-3 * (drawn if n.position_delay_ms is None else n.position_delay_ms) * sitl.rate_hz)
         c["mocap_sigma"] = math.radians(n.mocap_deg)
-        c["mocap_every"], c["mocap_delay"] = sitl.loop_hz // n.mocap_rate_hz, round(1e-3 * n.mocap_delay_ms * sitl.loop_hz)
-        wn = 2.0 * math.pi * _GYRO_CUTOFF_HZ[sitl.personality]
+        c["mocap_every"], c["mocap_delay"] = sitl.rate_hz // n.mocap_rate_hz, round(1e-3 * n.mocap_delay_ms * sitl.rate_hz)
+        wn = 2.0 * math.pi * tuning.gyro_cutoff_hz
         c["filter_b"], c["filter_a"] = wn * wn * dt, math.sqrt(2.0) * wn * dt
 
     def _fill_tuning(self, sitl: config.Sitl, tuned: Airframe) -> None:
         c = self.constants
         assert tuned.rotors is not None
-        c["personality"] = {"px4": 0, "ardupilot": 1}[sitl.personality]
+        tuning = _TUNING[sitl.personality]
+        c["personality"] = tuning.number
         c["tuned_inertia"], c["tuned_thrust_max_n"] = tuned.body.inertia_kg_m2, tuned.rotors.thrust_max_n
         c["idle"] = tuned.rotors.thrust_min_n / tuned.rotors.thrust_max_n
         c["allocation"], c["hover_thrust"] = rotors.allocation(tuned), tuned.hover_thrust
-        c["rate_p"], c["rate_i"], c["rate_d"] = (28.0, 28.0, 6.0), (15.0, 15.0, 3.0), (0.3, 0.3, 0.0)
-        c["attitude_p"], c["rate_limit"] = (9.0, 9.0, 2.8), (3.84, 3.84, 3.49)
-        c["position_every"] = sitl.loop_hz // 100
-        c["accel_max"], c["tilt_max_rad"] = 20.0, math.radians(45.0)
+        c["rate_p"], c["rate_i"] = (tuning.rate_p, tuning.rate_p, 6.0), (tuning.rate_i, tuning.rate_i, 3.0)
+        c["rate_d"] = tuning.rate_d, tuning.rate_d, 0.0
+        c["position_every"] = sitl.rate_hz // 100
+        c["accel_max"] = 20.0
 
     def _stand(self, sitl: config.Sitl) -> None:
         """On the ground, at rest, sensors settled: the first instant is as good as any later one."""
         s, start = self.state, sitl.start
         R = rotation.from_euler(0.0, 0.0, math.radians(start.yaw_deg))
-        s["p_ned_m"], s["R"], s["ahrs_R"], s["target_R"], s["grounded"] = start.p_ned_m, R, R, R, 1
+        s["p_ned_m"], s["grounded"] = start.p_ned_m, 1
+        for name in ("R", "ahrs_R", "wanted_R", "target_R", "shaped_R"):
+            s[name] = R
         s["past"][:, :3], s["past_R"][:] = start.p_ned_m, R
         s["ahrs_q_wxyz"] = rotation.to_quaternion(R)
         self.setpoint["yaw_rad"] = math.radians(start.yaw_deg)
