@@ -472,10 +472,13 @@ def _control(plan: Plan, f: Flight, t_us: int, dt_s: float) -> None:
     demand = demand_at(plan, f, t_us) if active else Demand(t_us, NAN3, ZERO3, ZERO3, ZERO3, 0.0, 0.0)
     nominal = command = Command(NAN3, 0.0, 0.0, NAN3, ZERO3)
     if active:
+        before = f.controller
         f.controller, nominal = plan.controller.module.step(
             plan.controller.gains, f.controller, estimate, demand, lambda t: demand_at(plan, f, t), dt_s
         )
         command = nominal
+        if hasattr(plan.controller.module, "messages"):  # a controller with something to say beside its setpoint
+            _send_all(plan, f, plan.controller.module.messages(before, f.controller, t_us))
     if plan.compensator is not None:
         f.compensator, corrected = plan.compensator.module.step(
             plan.compensator.gains, f.compensator, estimate, nominal, applied, t_us

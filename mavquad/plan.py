@@ -27,6 +27,7 @@ CONTROLLERS = {
     "adrc": ("mavquad.control.adrc_flight", "leso"),
     "iadrc": ("mavquad.control.iadrc_flight", "joint"),
     "eskf-mpc": ("mavquad.control.mpc_flight", "eskf"),
+    "sweep": ("mavquad.sweep_flight", "direct"),  # excites for identification
 }
 COMPENSATORS = {"asmf": "mavquad.active_flight"}
 OBSERVERS = {"gsmo": "mavquad.estimate.gsmo"}

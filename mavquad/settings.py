@@ -9,7 +9,7 @@ from mavquad.errors import ConfigError
 from mavquad.paths import Path
 from mavquad.setpoint.limits import Limits
 
-CONTROLLERS = ("pd", "pid", "adrc", "iadrc", "eskf-mpc", "autopilot")
+CONTROLLERS = ("pd", "pid", "adrc", "iadrc", "eskf-mpc", "autopilot", "sweep")
 
 
 class Link(config.Section, frozen=True):
@@ -52,7 +52,7 @@ class Companion(config.Section, frozen=True):
 
     airframe: str = "x500"
     airframe_set: tuple[str, ...] = ()
-    controller: Literal["pd", "pid", "adrc", "iadrc", "eskf-mpc", "autopilot"] = "pid"
+    controller: Literal["pd", "pid", "adrc", "iadrc", "eskf-mpc", "autopilot", "sweep"] = "pid"
     estimator: str = "auto"  # the controller's own
     compensator: Literal["none", "asmf"] = "none"
     observers: tuple[str, ...] = ("gsmo",)

@@ -30,8 +30,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--personality", choices=("px4", "ardupilot"), default="px4", help="whose autopilot (default: %(default)s)"
     )
-    parser.add_argument("--airframe", default="x500", help="a vehicle's name, or a TOML file (default: %(default)s)")
+    parser.add_argument(
+        "--airframe", "--vehicle", default="x500", help="a vehicle's name, or a TOML file (default: %(default)s)"
+    )
     parser.add_argument("--controller", help="pd, pid, adrc, iadrc, eskf-mpc, or autopilot (its own position loop)")
+    parser.add_argument(
+        "--axis", action="append", choices=("roll", "pitch", "yaw", "thrust"), help="of the scenario `sweep`; again for more"
+    )
     parser.add_argument("--estimator", help="what feeds the controller (default: the controller's own)")
     parser.add_argument("--compensator", help="none or asmf")
     parser.add_argument("--observer", action="append", metavar="NAME[:KEY=VALUE,...]", help="one more to watch; again for more")
@@ -53,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.speed is not None and not 0.01 <= args.speed <= 1000.0:
         raise FlightError(f"--speed {args.speed}: expected 0.01 to 1000 times real time, or no --speed for lockstep")
-    resolved = scenarios.resolve(scenarios.load(args.scenario, args.set), _options(args))
+    resolved = scenarios.resolve(scenarios.load(args.scenario, [*args.set, *_axes(args)]), _options(args))
     plan.build(resolved.companion)  # what is wrong with it is known before anything starts
     name = Path(args.scenario).stem
     folder = args.run or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}-{args.seed}"
@@ -77,6 +82,19 @@ def run(args: argparse.Namespace) -> int:
     if not result["ok"]:
         raise FlightError(f"the flight was not as it should be: {'; '.join(result['failures'])}; its logs are in {folder}")
     return 0
+
+
+def _axes(args: argparse.Namespace) -> list[str]:
+    """--axis as changes of the scenario: which axes are swept, and a path as long as that takes."""
+    if not args.axis:
+        return []
+    if args.scenario != "sweep":
+        raise FlightError(f"--axis is for the scenario sweep; {args.scenario} is flown as its path says")
+    from mavquad import sweep_flight
+
+    axes = tuple(dict.fromkeys(args.axis))
+    seconds = sweep_flight.duration_s(sweep_flight.Params(axes=axes))
+    return [f"sweep.axes={json.dumps(axes)}", f"path.duration_s={seconds + 3.0:.0f}"]
 
 
 def _options(args: argparse.Namespace) -> Any:
@@ -107,7 +125,7 @@ def _command(args: argparse.Namespace) -> str:
         value = getattr(args, name)
         if value not in (None, {"personality": "px4", "airframe": "x500", "attitude": "ahrs"}.get(name)):
             words += [f"--{name}", str(value)]
-    for name in ("observer", "set"):
+    for name in ("axis", "observer", "set"):
         for value in getattr(args, name) or []:
             words += [f"--{name}", value]
     return shlex.join(words)

@@ -21,14 +21,14 @@ def test_every_scenario_resolves_with_the_standard_conditions(name):
     assert (sitl.noise.position_m, sitl.noise.velocity_m_s, sitl.noise.attitude_deg) == (0.02, 0.03, 0.2)
     assert (sitl.noise.gyro_rad_s, sitl.noise.accel_m_s2, sitl.link.delay_ms) == (0.005, 0.05, 5.0)
     assert (sitl.seed, companion.seed, companion.takeoff_m) == (7, 7, 5.0)
-    assert companion.path.name == ("circle" if name == "gusty" else name)
+    assert companion.path.name == {"gusty": "circle", "sweep": "hover"}.get(name, name)
     for resolved, kind in ((sitl, Sitl), (companion, Companion)):  # as written into the run folder
         again = config.convert(tomllib.loads(toml.dumps(msgspec.to_builtins(resolved))), kind, name)
         assert again == resolved
 
 
 def test_the_standard_scenarios_are_those_of_the_architecture():
-    assert scenarios.names() == ["circle", "ellipse", "gusty", "hover", "line", "rectangle", "spiral"]
+    assert scenarios.names() == ["circle", "ellipse", "gusty", "hover", "line", "rectangle", "spiral", "sweep"]
     sitl = scenarios.resolve(scenarios.load("gusty"), scenarios.Options()).sitl
     assert tuple(sitl.overrides) == ("body.mass_kg=+20%",)
     assert (sitl.wind.mean_m_s, sitl.wind.w20_m_s, sitl.wind.gusts[0].speed_m_s) == (5.0, 8.0, 6.0)
