@@ -246,6 +246,15 @@ class Autopilot(ABC):
     def disarm_after_s(self) -> float:
         """How long it stands before it disarms by itself."""
 
+    def estimator_jumped(self, jump_m: list[float]) -> None:
+        """The estimator has moved its position: own targets move with it, those from outside do not."""
+        state, sp = self.vehicle.state, self.vehicle.setpoint
+        state["aim_p"] = state["aim_p"] + jump_m
+        if self.task != "external":
+            sp["p_ned_m"] = sp["p_ned_m"] + jump_m
+            self._target_d += jump_m[2]
+            self._climb_d += jump_m[2]
+
     # ---- inside -------------------------------------------------------------------------------------------------------
     def _stop(self) -> None:
         self.task = "none"
@@ -289,8 +298,8 @@ class Autopilot(ABC):
             self._ground_us, self.landed, self.flown = self.t_us, False, True
             return
         impact = self.vehicle.state["impact_m_s"]
-        if self.armed and impact > CRASH_M_S:
-            self.crashed = True
+        if impact > CRASH_M_S:
+            self.crashed, self.ended_us = True, self.t_us
             self.say(EMERGENCY, f"Crash: touched down at {impact:.1f} m/s")
             self.disarm(True, "crash")
         self.vehicle.state["impact_m_s"] = 0.0

@@ -12,6 +12,7 @@ from mavquad.errors import WireError
 from mavquad.wire import Frame
 from sitl import ardupilot, config, links, px4, telemetry
 from sitl.autopilot import TICK_US, Autopilot, check_airframe
+from sitl.faults import Faults
 from sitl.links import NEVER, Link, Stream
 from sitl.params import Table
 from sitl.services import Services
@@ -20,6 +21,7 @@ from sitl.vehicle import Vehicle
 COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 _HEARTBEAT, _TIMESYNC = wire.ID["HEARTBEAT"], wire.ID["TIMESYNC"]
 TRUTH_COMPONENT = 25  # MAV_COMP_ID_USER1: truth has a sequence of its own
+_BOOT_SILENCE_US = 1_500_000
 Record = Callable[[list[tuple[int, bytes]]], None]
 
 
@@ -38,7 +40,6 @@ class Simulation:
         self.links: list[Link] = []
         self.partner: Link | None = None  # of the lockstep
         self.periods = self.engaged_periods = self.misses = 0
-        self.sick: set[str] = set()  # sensors with a fault
         # ArduPilot sends its gyro behind its low-pass
         self.gyro_name = "gyro_rad_s" if sitl.personality == "px4" else "rates_rad_s"
         self.mocap_age_us = 1000 * sitl.noise.mocap_delay_ms
@@ -46,6 +47,9 @@ class Simulation:
         self._records: list[tuple[int, bytes]] = []
         self._period_us = 1000 * sitl.period_ms
         self._services = Services(self)
+        self.faults = Faults(sitl.faults, self)
+        self._reboot_us = NEVER
+        self._silent_until_us = 0
         self.autopilot = self._boot()
         self._tick_us = TICK_US
         self._stream_us = NEVER
@@ -102,8 +106,9 @@ class Simulation:
         return links.datagrams(frames)
 
     def send(self, link: Link, name: str, fields: tuple[Any, ...]) -> None:
-        """One message to one peer."""
-        link.down.put(self.t_us, (name, fields))
+        """One message to one peer; none while the autopilot boots."""
+        if self.t_us >= self._silent_until_us:
+            link.down.put(self.t_us, (name, fields))
 
     def say(self, severity: int, text: str) -> None:
         """STATUSTEXT to every peer, cut at MAVLink's 50 characters."""
@@ -146,9 +151,13 @@ class Simulation:
         vehicle, links_, dt_us = self.vehicle, self.links, self.vehicle.dt_us
         now_us = vehicle.t_us
         while now_us < t_us:
-            due_us = min(t_us, self._stream_us, self._tick_us, *[link.up.due_us for link in links_])
+            due_us = min(t_us, self._stream_us, self._tick_us, self.faults.due_us, *[link.up.due_us for link in links_])
             vehicle.run(max(1, -(-(due_us - now_us) // dt_us)))
             now_us = vehicle.t_us
+            if now_us >= self.faults.due_us:
+                self.faults.apply(now_us)
+            if now_us >= self._reboot_us:
+                self.reboot()
             for link in links_:
                 if link.up.due_us <= now_us:
                     for raw in link.up.take(now_us, _as_it_is):
@@ -161,11 +170,6 @@ class Simulation:
             if now_us >= self._stream_us:
                 self._emit(now_us)
 
-    # ---- sensors as they are sent -------------------------------------------------------------------------------------
-    def sensor(self, name: str) -> list[float]:
-        """A sensor's last value."""
-        return self.vehicle.state.view[name].tolist()
-
     def battery(self) -> float:
         """What is left of the battery, 1 to 0."""
         life_s = self.config.battery_s
@@ -173,7 +177,20 @@ class Simulation:
 
     def reboot_at(self, t_us: int) -> None:
         """The autopilot starts again then."""
-        raise NotImplementedError
+        self._reboot_us = t_us
+
+    def reboot(self) -> None:
+        """The autopilot starts again: rotors stop, its clock and sequences begin anew, and for a while it says nothing."""
+        self._reboot_us = NEVER
+        params = self.autopilot.params
+        self.autopilot = self._boot()
+        self.autopilot.params = params
+        self.autopilot.apply_params()
+        self._silent_until_us = self.t_us + _BOOT_SILENCE_US
+        for link in self.links:
+            link.restart()
+            for name in link.streams:
+                self.set_interval(link, name, 0)
 
     # ---- inside -------------------------------------------------------------------------------------------------------
     def _boot(self) -> Autopilot:
@@ -196,13 +213,15 @@ class Simulation:
         return {"px4": px4, "ardupilot": ardupilot}[self.config.personality].STREAMS_HZ.get(name, 0.0)
 
     def _emit(self, t_us: int) -> None:
+        silent, dropping = t_us < self._silent_until_us, self.faults.dropping
         next_us = NEVER
         for link in self.links:
             put = link.down.put
             for stream in link.ordered:
                 if stream.due_us <= t_us:
                     stream.due_us += stream.interval_us
-                    fields = stream.build()
+                    quiet = silent or (dropping and self.faults.drops(stream.name))
+                    fields = None if quiet else stream.build()
                     if fields is not None:
                         put(t_us, (stream.name, fields))
                 if stream.due_us < next_us:
@@ -243,6 +262,8 @@ class Simulation:
 
     def _arrived(self, link: Link, raw: bytes) -> None:
         """One frame at the end of its wire: for us, for others, or both."""
+        if self.t_us < self._silent_until_us:
+            return
         frames, refused, rest = wire.split(raw)
         link.refused += refused + len(rest)
         for frame in frames:

@@ -19,7 +19,7 @@ NAN = math.nan
 _ZEROS_12 = (0,) * 12
 # gyro, accelerometer, magnetometer, pressure, GPS, rate, attitude, yaw, z, xy control, motors, AHRS, battery, pre-arm check
 _SENSORS = 1 | 2 | 4 | 8 | 32 | 1024 | 2048 | 4096 | 8192 | 16384 | 32768 | 1 << 21 | 1 << 25 | 1 << 28
-_HEALTH = {"gyro": 1, "accel": 2, "imu": 3, "attitude": 1 << 21, "position": 32}
+_HEALTH = {"gyro": 1, "accel": 2, "attitude": 1 << 21, "position": 32}
 _FULL_MV, _EMPTY_MV = 16_800, 13_200
 
 # the order in which messages of one instant leave: the attitude last, since a companion is paced by it
@@ -48,9 +48,9 @@ ORDER = (
     "ATTITUDE_QUATERNION",
 )
 SENSOR_OF = {  # whose dropout silences a message
-    "HIGHRES_IMU": ("imu", "gyro", "accel"),
-    "RAW_IMU": ("imu", "gyro", "accel"),
-    "SCALED_IMU": ("imu", "gyro", "accel"),
+    "HIGHRES_IMU": ("gyro", "accel"),
+    "RAW_IMU": ("gyro", "accel"),
+    "SCALED_IMU": ("gyro", "accel"),
     "ATT_POS_MOCAP": ("mocap",),
     "LOCAL_POSITION_NED": ("position",),
     "GLOBAL_POSITION_INT": ("position",),
@@ -61,7 +61,7 @@ SENSOR_OF = {  # whose dropout silences a message
 
 def builders(sim: "Simulation") -> dict[str, Callable[[], Fields | None]]:
     """Every message that this autopilot can stream: name -> a function that gives its fields, or None for nothing to say."""
-    v, read = sim.vehicle, sim.sensor
+    v, read = sim.vehicle, sim.faults.read
 
     def boot_us() -> int:
         return v.t_us - sim.autopilot.boot_us
@@ -72,11 +72,11 @@ def builders(sim: "Simulation") -> dict[str, Callable[[], Fields | None]]:
     def highres_imu() -> Fields:
         state = v.state.view
         air = (*state["magnetometer_gauss"].tolist(), *state["barometer"].tolist())
-        return v.t_us - sim.autopilot.boot_us, *read("accel_m_s2"), *read(sim.gyro_name), *air, 25.0, 0x1FFF, 0
+        return v.t_us - sim.autopilot.boot_us, *read("accel", "accel_m_s2"), *read("gyro", sim.gyro_name), *air, 25.0, 0x1FFF, 0
 
     def coarse_imu() -> tuple[int, ...]:
-        a = [_int16(1000.0 / GRAVITY_M_S2 * x) for x in read("accel_m_s2")]
-        g = [_int16(1000.0 * x) for x in read(sim.gyro_name)]
+        a = [_int16(1000.0 / GRAVITY_M_S2 * x) for x in read("accel", "accel_m_s2")]
+        g = [_int16(1000.0 * x) for x in read("gyro", sim.gyro_name)]
         m = [_int16(1000.0 * x) for x in v.state.view["magnetometer_gauss"].tolist()]
         return (*a, *g, *m)
 
@@ -86,12 +86,12 @@ def builders(sim: "Simulation") -> dict[str, Callable[[], Fields | None]]:
     def local_position_ned() -> Fields | None:
         if not sim.autopilot.has_origin:
             return None
-        return boot_ms(), *read("nav_p_ned_m"), *read("nav_v_ned_m_s")
+        return boot_ms(), *read("position", "nav_p_ned_m"), *read("position", "nav_v_ned_m_s")
 
     def global_position_int() -> Fields | None:
         if not sim.autopilot.has_origin:
             return None
-        p, u = read("nav_p_ned_m"), read("nav_v_ned_m_s")
+        p, u = read("position", "nav_p_ned_m"), read("position", "nav_v_ned_m_s")
         if not all(map(math.isfinite, (*p, *u))):
             return None  # integers have no NaN
         lat, lon, alt = geodetic(p)
@@ -108,7 +108,7 @@ def builders(sim: "Simulation") -> dict[str, Callable[[], Fields | None]]:
         return boot_us(), 3, lat, lon, height, 80, 120, speed, course, 14, height, 300, 400, 50, 0, 0
 
     def sys_status() -> Fields:
-        health = _SENSORS & ~sum({_HEALTH[s] for s in sim.sick if s in _HEALTH})
+        health = _SENSORS & ~sum({_HEALTH[s] for s in sim.faults.sick if s in _HEALTH})
         left = sim.battery()
         volts = round(_EMPTY_MV + (_FULL_MV - _EMPTY_MV) * left)
         return _SENSORS, _SENSORS, health, 250, volts, 1500, round(100 * left), 0, 0, 0, 0, 0, 0, 0, 0, 0
@@ -155,8 +155,8 @@ def builders(sim: "Simulation") -> dict[str, Callable[[], Fields | None]]:
         "SCALED_IMU": lambda: (boot_ms(), *coarse_imu(), 2500),
         "ATT_POS_MOCAP": lambda: (
             v.t_us - sim.autopilot.boot_us - sim.mocap_age_us,
-            read("mocap_q_wxyz"),
-            *read("mocap_p_ned_m"),
+            read("mocap", "mocap_q_wxyz"),
+            *read("mocap", "mocap_p_ned_m"),
             (NAN,) + (0.0,) * 20,
         ),
         "LOCAL_POSITION_NED": local_position_ned,
@@ -174,8 +174,13 @@ def builders(sim: "Simulation") -> dict[str, Callable[[], Fields | None]]:
         "VFR_HUD": vfr_hud,
         "BATTERY_STATUS": battery_status,
         "SIM_STATE": sim_state,
-        "ATTITUDE": lambda: (boot_ms(), *read("ahrs_euler_rad"), *read("rates_rad_s")),
-        "ATTITUDE_QUATERNION": lambda: (boot_ms(), *read("ahrs_q_wxyz"), *read("rates_rad_s"), (0.0,) * 4),
+        "ATTITUDE": lambda: (boot_ms(), *read("attitude", "ahrs_euler_rad"), *read("attitude", "rates_rad_s")),
+        "ATTITUDE_QUATERNION": lambda: (
+            boot_ms(),
+            *read("attitude", "ahrs_q_wxyz"),
+            *read("attitude", "rates_rad_s"),
+            (0.0,) * 4,
+        ),
     }
 
 
