@@ -35,6 +35,7 @@ WOUND_UP_M_S2 = 1.0  # how far beyond the bounds a controller's own estimate is 
 PUBLISHED = (
     "f_n", "f_e", "f_d", "low_n", "low_e", "low_d", "high_n", "high_e", "high_d", "f_roll", "f_pitch",
     "half_width", "guarantee", "empty", "inflations", "authority", "given_back_n", "given_back_e", "given_back_d",
+    "thrust",  # specific, as the model thinks it acts: what f is measured against
 )  # fmt: skip
 
 
@@ -188,14 +189,14 @@ def step(
 def published(state: State) -> tuple[float, ...]:
     """What is shown, named by PUBLISHED. NaN before there is an estimate."""
     if state.model is None:
-        return (math.nan,) * 12 + (0.0,) * 3 + (state.authority, *state.given_back_m_s2)
+        return (math.nan,) * 12 + (0.0,) * 3 + (state.authority, *state.given_back_m_s2, math.nan)
     inner = state.model.filter
     n, e, d = (quad_error.bounds_f(state.model, axis) for axis in range(3))
     x = inner.x
     return (
         float(x[3]), float(x[4]), float(x[5]), n.low, e.low, d.low, n.high, e.high, d.high, float(x[8]), float(x[9]),
         _half_width(state.model), 1.0 if inner.guarantee and n.consistent and e.consistent and d.consistent else 0.0,
-        float(inner.empty), float(inner.inflations), state.authority, *state.given_back_m_s2,
+        float(inner.empty), float(inner.inflations), state.authority, *state.given_back_m_s2, state.model.thrust_m_s2,
     )  # fmt: skip
 
 
