@@ -11,9 +11,9 @@ Deviations from the paper:
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 
 from mavquad.errors import ConfigError
+from mavquad.statespace import zoh
 
 
 class Augmented(NamedTuple):
@@ -23,13 +23,6 @@ class Augmented(NamedTuple):
     g: np.ndarray  # (n + n_f, n_u)
     known: np.ndarray  # (n + n_f, n)
     c: np.ndarray  # (n_y, n + n_f)
-
-
-def zoh(a: np.ndarray, b: np.ndarray, dt_s: float) -> tuple[np.ndarray, np.ndarray]:
-    """(A_d, B_d) of x' = A x + B u, u held over dt. a (n, n), b (n, m)."""
-    n, m = b.shape
-    block = scipy.linalg.expm(dt_s * np.block([[a, b], [np.zeros((m, n + m))]]))
-    return block[:n, :n], block[:n, n:]
 
 
 def with_model_error(

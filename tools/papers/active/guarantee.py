@@ -8,11 +8,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg
 
+from mavquad.compensate import helicopter
 from mavquad.estimate import asmf, asmf_joint, augment, ellipsoid, interval
 from mavquad.identify import models
 from mavquad.jit import kernel
+from mavquad.statespace import zoh
 
 DT_S = 0.02
 STEPS = 3000
@@ -20,7 +21,6 @@ SQUARE_STEPS = 50
 ROWS = ("u", "q", "v", "p", "w", "r")
 E = {"u": 0.05, "q": 0.01, "theta": 0.005, "v": 0.05, "p": 0.01, "phi": 0.005, "w": 0.05, "r": 0.01}
 B_F = {"u": 0.01, "q": 0.02, "v": 0.01, "p": 0.02, "w": 0.01, "r": 0.02}
-LQR_WEIGHTS = {"theta": 4.0, "phi": 4.0, "p": 0.02, "q": 0.02, "u": 1e-4, "v": 1e-4, "w": 0.01, "r": 0.01}
 
 # form, rho on scaled outputs, R = diag(e^2) without the factor m, model error on every state
 VARIANTS = {
@@ -42,19 +42,6 @@ class Containment(NamedTuple):
     error: np.ndarray  # (n_f,) mean absolute
     empty: int
     inflations: int
-
-
-def dlqr(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """K of u = -K x for x(k+1) = a x + b u, cost x^T q x + u^T r u."""
-    p = scipy.linalg.solve_discrete_are(a, b, q, r)
-    return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)
-
-
-def attitude_lqr(model: models.Model) -> np.ndarray:
-    """The inner loop that PI and the paper's correction share: K (4, 13) on the states of the model at 50 Hz."""
-    a_d, b_d = augment.zoh(model.a, model.b, DT_S)
-    weights = np.array([LQR_WEIGHTS.get(state, 0.0) for state in model.states])
-    return dlqr(a_d, b_d, np.diag(weights), np.eye(model.b.shape[1]))
 
 
 def box_noise(rng: np.random.Generator, kind: str, steps: int, size: np.ndarray) -> np.ndarray:
@@ -85,7 +72,7 @@ def contain(variant: str, noise: str, seed: int, *, steps: int = STEPS, b_model:
     w = np.zeros((steps, 19))
     w[:, 13:] = box_noise(rng, noise, steps, b)
     picks = np.array([13 + model.states.index(name) for name in ROWS] if on_all else range(13, 19))
-    k = attitude_lqr(model)
+    k = helicopter.gains(helicopter.Params(), model.a, model.b, model.states).k_attitude
     inside, width, error, state = _contain(
         (form != "strips", scaled, form == "printed"),
         filter_gains,
@@ -120,7 +107,7 @@ def decoupled(b_f: float, seed: int, *, steps: int = STEPS) -> dict[str, tuple[f
 def _error_on_every_state(model: models.Model, b: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """B_f = I_13, which `augment` refuses: 26 unknowns for eight outputs. The five hidden errors may move as f_u does."""
     n = model.a.shape[0]
-    a_d, b_d = augment.zoh(model.a, np.hstack([model.b, np.eye(n)]), DT_S)
+    a_d, b_d = zoh(model.a, np.hstack([model.b, np.eye(n)]), DT_S)
     f = np.block([[a_d, b_d[:, 4:]], [np.zeros((n, n)), np.eye(n)]])
     g = np.vstack([b_d[:, :4], np.zeros((n, 4))])
     b_all = np.concatenate([np.zeros(n), np.full(n, 0.01)])

@@ -56,6 +56,30 @@ def line(speed_m_s: float, course_rad: float, dt_s: float, *, length_m: float = 
     return Path(along[:, None] * course, speed[:, None] * course, accel[:, None] * course, np.zeros(speed.size))
 
 
+def there_and_back(course_rad: float, dt_s: float, *, speed_m_s: float = 10.0, length_m: float = 650.0) -> Path:
+    """Paper 004, section 4.3: hover, turn to the course at 25 s, cruise from 50 s, hover, turn about at 150 s, return from 160 s.
+
+    Turns at 0.4 rad/s, 1 m/s^2 along the path; the first turn is half a circle, too.
+    """
+    n = round(250.0 / dt_s)
+    speed = np.zeros(n)
+    leg = _rest_to_rest(length_m, speed_m_s, 1.0, dt_s)
+    for start_s, sign in ((50.0, 1.0), (160.0, -1.0)):
+        first = round(start_s / dt_s)
+        speed[first : first + leg.size] = sign * leg
+    speed = _smooth(speed, dt_s)
+    rate = np.zeros(n)
+    turn = round(math.pi / 0.4 / dt_s)
+    for start_s in (25.0, 150.0):
+        first = round(start_s / dt_s)
+        rate[first : first + turn] = math.pi / (turn * dt_s)
+    rate = _smooth(rate, dt_s)
+    along = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * dt_s)])
+    yaw = course_rad - math.pi + np.concatenate([[0.0], np.cumsum(0.5 * (rate[1:] + rate[:-1]) * dt_s)])
+    course = np.array([math.cos(course_rad), math.sin(course_rad), 0.0])
+    return Path(along[:, None] * course, speed[:, None] * course, np.gradient(speed, dt_s)[:, None] * course, yaw)
+
+
 def ellipse(
     speed_m_s: float, duration_s: float, dt_s: float, *, axes_m: tuple[float, float] = (20.0, 17.5), accel_m_s2: float = 2.5
 ) -> Path:
