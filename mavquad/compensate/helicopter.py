@@ -41,7 +41,7 @@ class Params:
     low_pass_rad_s: float = 3.0  # of the paper's correction
     correction_max: float = 0.6  # of full stick; 0.3 on a real vehicle
     tilt_max_rad: float = 0.25  # of the correction
-    target_low_pass_rad_s: float = 6.0  # of f in the full-state target
+    target_low_pass_rad_s: float = 20.0  # of f in the full-state target
     error_max_m: float = 4.0
     integral_1_s: float = 0.2
     integral_max_m: float = 1.5
