@@ -36,9 +36,13 @@ def commands() -> dict[str, str]:
 
 
 def papers() -> dict[str, str]:
-    """Every paper's command, with the first line of its docstring."""
-    paths = sorted((FOLDER / "papers").glob("*.py"))
-    return {p.stem.replace("_", "-"): _first_line(p) for p in paths if "def add_arguments" in p.read_text(encoding="utf-8")}
+    """Every paper's command, with its one line."""
+    found = {}
+    for path in sorted((FOLDER / "papers").glob("*.py")):
+        if "\ndef run(args" in path.read_text(encoding="utf-8"):
+            name = path.stem.replace("_", "-")
+            found[name] = _first_line(path).removeprefix(f"mavquad paper {name}: ")
+    return found
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -108,7 +112,7 @@ def _unknown(name: str, known: dict[str, str], what: str, help_command: str) -> 
 def _first_line(path: Path) -> str:
     with path.open(encoding="utf-8") as stream:
         line = stream.readline().strip()
-    return line.removeprefix('"""').removesuffix('"""') if line.startswith('"""') else ""
+    return line.removeprefix('"""').removesuffix('"""').removesuffix(".") if line.startswith('"""') else ""
 
 
 if __name__ == "__main__":

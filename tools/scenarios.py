@@ -27,6 +27,7 @@ VEHICLE = {  # short names of what a vehicle can differ in from its file
     "thrust": "rotors.thrust_max_n",
     "motor_lag": "rotors.lag_s",
 }
+MOCAP_OBSERVERS = ("gsmo:source=mocap", "gsmo:source=mocap,torque=motors")  # rates without a gyro, torque unknown and known
 COMPANION_TABLES = ("limits", "safety")
 
 
@@ -129,6 +130,8 @@ def resolve(scenario: Scenario, options: Options) -> Resolved:
         faults=scenario.faults,
         params=scenario.params,
     )
+    if options.observers is None and options.attitude != "ahrs":
+        options = msgspec.structs.replace(options, observers=[*MOCAP_OBSERVERS])
     chosen = {name: getattr(options, name) for name in ("controller", "estimator", "compensator", "observers", "loop")}
     companion = _over(
         {

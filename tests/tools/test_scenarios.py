@@ -36,6 +36,18 @@ def test_the_standard_scenarios_are_those_of_the_architecture():
     assert (line.length_m, line.speed_m_s, line.accel_m_s2) == (200.0, 12.0, 2.5)
 
 
+def test_with_mocap_the_observer_runs_on_it_with_torque_known_and_unknown():
+    for attitude, expected in (
+        ("ahrs", ["gsmo"]),
+        ("mocap", [*scenarios.MOCAP_OBSERVERS]),
+        ("both", [*scenarios.MOCAP_OBSERVERS]),
+    ):
+        resolved = scenarios.resolve(scenarios.load("circle"), scenarios.Options(attitude=attitude))
+        assert list(resolved.companion.observers) == expected
+    chosen = scenarios.resolve(scenarios.load("circle"), scenarios.Options(attitude="mocap", observers=["gsmo"]))
+    assert list(chosen.companion.observers) == ["gsmo"]
+
+
 def test_set_reaches_the_vehicle_the_simulator_and_the_companion():
     changes = [
         "vehicle.mass=+20%",
