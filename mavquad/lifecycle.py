@@ -318,6 +318,8 @@ def _before_flight(life: Life, sight: Sight, now_us: int, settings: Companion) -
             return release(life, now_us, "GUID_OPTIONS cannot be read")
         if not int(options) & 8:  # thrust would be a climb rate
             return release(life, now_us, "set GUID_OPTIONS to 8")
+    if life.phase in ("takeoff", "climb", "takeover") and not life.armed and waited_s > 3.0:
+        life = life._replace(phase="", since_us=now_us)  # it has disarmed, or restarted so early that its clock did not show it
     aloft = life.armed and (life.landed == 2 or sight.height_m > 0.5 * settings.takeoff_m)
     if life.phase in ("climb", "takeover"):
         at_height = life.phase == "takeover" or abs(sight.height_m - settings.takeoff_m) < 0.35

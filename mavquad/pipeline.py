@@ -169,8 +169,8 @@ def _tick(plan: Plan, f: Flight, now_us: int) -> None:
     before = f.life
     f.life, sends = lifecycle.on_tick(f.life, sight, now_us, plan.settings)
     _send_all(plan, f, sends)
-    if f.life.state == STREAMING and before.state != STREAMING:
-        anchor(plan, f)
+    if f.life.state == STREAMING and (before.state != STREAMING or not lifecycle.guided(f.life)):
+        anchor(plan, f)  # until our setpoints are flown the start point goes along with the vehicle
     if f.life.state == ENGAGED and before.state != ENGAGED:
         f.path_t0_us = f.now_us + round(1e6 * plan.settings.settle_s)
     if f.life.state in (STREAMING, ENGAGED):

@@ -96,7 +96,9 @@ class Autopilot:
         return out
 
     def _move(self, dt: float) -> None:
-        if self.mode == OFFBOARD and self.setpoints:
+        if self.mode == OFFBOARD and self.t_us - self.setpoints[-1][0] > 500_000:
+            self.mode = HOLD  # its own failsafe: setpoints have stopped
+        if self.mode == OFFBOARD:
             m = self.setpoints[-1][1]
             w, x, y, z = m.q
             self.q, self.thrust = (w, x, y, z), m.thrust
