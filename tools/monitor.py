@@ -85,7 +85,7 @@ def once(feed: Feed, args: argparse.Namespace) -> int:
 
 def lines(feed: Feed, args: argparse.Namespace) -> int:
     """A line a second: of wall time, or of log time as fast as it can be read when a log is not played slower."""
-    said, told = 0, ""
+    said, silent = 0, False
     while True:
         if isinstance(feed, Playback):
             if feed.over:
@@ -97,9 +97,9 @@ def lines(feed: Feed, args: argparse.Namespace) -> int:
             if feed.error:
                 print(feed.error, file=sys.stderr)
                 return 1
-            if not feed.watch.frames and feed.status() != told and "nothing heard" in feed.status():
-                told = feed.status()
-                print(told, file=sys.stderr)
+            if feed.silent and not silent:
+                print(feed.status(), file=sys.stderr)
+            silent = feed.silent
         if args.json:
             print(json.dumps(watch_text.status(feed.watch, args.system)), flush=True)
             continue

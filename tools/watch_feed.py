@@ -16,6 +16,7 @@ from tools.watch import AUTOPILOT, HEARTBEAT, LOST_US, Watch
 
 REQUESTER = (254, 190)  # not 255: no autopilot must take us for its ground station and miss us when we go (GCS failsafe)
 _ASK_S, _TRIES = 0.5, 3
+_LISTEN_US = 2_000_000  # before the first request: what comes unasked?
 _BEFORE_US = 60_000_000  # a seek rebuilds what was seen from so long before
 _READ_S = 0.2
 SILENCE_S = 5.0
@@ -70,12 +71,17 @@ class Live:
         if self._requester is not None:
             self._requester.step(self.watch)
 
+    @property
+    def silent(self) -> bool:
+        """Nothing at all was heard, for longer than one would expect."""
+        return not self.watch.frames and clock.wall_us() - self._opened_us > SILENCE_S * 1e6
+
     def status(self) -> str:
         """What is to be said of the feed itself."""
         if self.error:
             return self.error
-        silent_s = 1e-6 * (clock.wall_us() - self._opened_us)
-        if not self.watch.frames and silent_s > SILENCE_S:
+        if self.silent:
+            silent_s = 1e-6 * (clock.wall_us() - self._opened_us)
             spoken = "" if self.name.startswith("udpin") or self._requester else "; a passive monitor does not speak first"
             return f"{self.name}: nothing heard for {silent_s:.0f} s{spoken}; still listening"
         return f"live {self.name}"
@@ -87,13 +93,16 @@ class Live:
 
 
 class Requester:
-    """Asks the first autopilot heard for message rates, one by one, each up to three times."""
+    """Asks the first autopilot heard for message rates, one by one, each up to three times.
+
+    Only for what does not come as fast already: a companion on the same vehicle may live on a faster rate.
+    """
 
     def __init__(self, endpoint: Endpoint) -> None:
         self._endpoint = endpoint
         self._left = list(RATES_HZ.items())
         self._tries = self._seq = 0
-        self._due_us = self._beat_us = 0
+        self._due_us = self._beat_us = self._from_us = 0
 
     def step(self, watch: Watch) -> None:
         now_us = watch.now_us
@@ -103,7 +112,13 @@ class Requester:
         if not watch.vehicles or not self._left:
             return
         vehicle = next(iter(watch.vehicles.values()))
+        self._from_us = self._from_us or now_us + _LISTEN_US
+        if now_us < self._from_us:
+            return
         name, hz = self._left[0]
+        if not self._tries and watch.rate_hz(vehicle.system, name) >= 0.9 * hz:
+            self._next()
+            return
         answer = vehicle.requests.get(wire.ID[name])
         if self._tries and answer is not None and answer.result != "asked":
             self._next()

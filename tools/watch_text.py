@@ -13,7 +13,7 @@ _CRITICAL = 2  # MAV_SEVERITY
 def status(watch: Watch, system: int | None = None) -> dict[str, Any]:
     """Everything of the line as plain numbers; None where it is not known. One vehicle: the first heard unless chosen."""
     vehicle = chosen(watch, system)
-    seconds = 1e-6 * (watch.now_us - watch.start_us)
+    seconds = 1e-6 * (watch.now_us - watch.start_us) if watch.frames else 0.0
     base: dict[str, Any] = {
         "t_s": round(seconds, 3),
         "frames": watch.frames,

@@ -10,7 +10,7 @@ import mmap
 import os
 import re
 from collections.abc import Iterator
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from mavquad.errors import LogError
 from mavquad.link import scan, tlog
 from mavquad.wire import Frame
 
-_BLOCK = 1 << 18  # messages found in one call of the kernel
+_RECORD = 40  # bytes that a record has at least, as a rule: so the first block of the index usually holds the whole log
 _ITEM = re.compile(r"(\d*)([a-zA-Z])")
 _TYPE = {"b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4", "q": "<i8", "Q": "<u8", "f": "<f4", "d": "<f8"}
 
@@ -120,15 +120,16 @@ class Log:
                 keys, slots = np.full(4 * keys.size, -1, np.int64), np.zeros(4 * keys.size, np.uint16)
                 key_of = np.concatenate([key_of, np.zeros(keys.size // 2 - key_of.size, np.int64)])
                 scan.rehash(key_of, count, keys, slots)
-            block = (np.empty(_BLOCK, np.int64), np.empty(_BLOCK, np.int64), np.empty(_BLOCK, np.uint16))
+            room = (self.size - int(place.at)) // _RECORD + 1000
+            block = (np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.uint16))
             n, count, place, done = scan.find(self._data, place, self.dialect.crc_extra, keys, slots, key_of, count, *block)
             parts.append(tuple(array[:n] for array in block))
-        index = scan.Index(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-        self.t_us, self._at, self._stream = index
-        self._order, self._border = scan.order_by_stream(self._stream, count)
+        index = parts[0] if len(parts) == 1 else [np.concatenate(column) for column in zip(*parts, strict=True)]
+        self.t_us, self._at, self._stream = scan.Index(*index)
+        counts = np.bincount(self._stream, minlength=count)
         self.streams = [
             Stream(int(key >> 8 & 0xFF), int(key & 0xFF), int(key >> 16), self.dialect.name(int(key >> 16)), int(n))
-            for key, n in zip(key_of[:count], np.diff(self._border), strict=True)
+            for key, n in zip(key_of[:count], counts, strict=True)
         ]
         self.signed = int(place.signed)
         self.junk_bytes = int(place.junk_bytes)
@@ -184,7 +185,7 @@ class Log:
         layouts = [self.dialect.layout(s.msgid) if s.msgid in self.dialect.classes else None for s in self.streams]
         length = np.array([layout.length if layout else 0 for layout in layouts], np.int64)
         row_words = np.array([layout.dtype.itemsize // 8 if layout else 0 for layout in layouts], np.int64)
-        border = np.cumsum([0, *(row_words * np.diff(self._border))])
+        border = np.cumsum([0, *(row_words * [s.messages for s in self.streams])])
         words = np.zeros(int(border[-1]), "<u8")
         first = np.where(row_words > 0, border[:-1], -1)
         scan.copy_all(self._data, self._at, self.t_us, self._stream, length, row_words, first, words)
@@ -196,8 +197,14 @@ class Log:
 
     def numbers(self, stream: Stream) -> NDArray[np.int64]:
         """Which messages of the log belong to a stream, in the order of the file."""
+        order, border = self._by_stream
         s = self.streams.index(stream)
-        return self._order[self._border[s] : self._border[s + 1]]
+        return order[border[s] : border[s + 1]]
+
+    @cached_property
+    def _by_stream(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        order, border = scan.order_by_stream(self._stream, len(self.streams))
+        return order, border
 
     def between(self, start_us: int | None = None, end_us: int | None = None) -> NDArray[np.int64]:
         """Numbers of all messages with a stamp in [start_us, end_us), in the order of the file."""

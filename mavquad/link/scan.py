@@ -37,6 +37,19 @@ _T = _crc_tables()
 T0, T1, T2, T3, T4, T5, T6, T7 = (np.ascontiguousarray(row) for row in _T)
 
 
+def _before() -> NDArray[np.uint64]:
+    """The register from which k zero bytes lead to 0xFFFF, k = 0..7: the step of one byte, backwards."""
+    high = {int(entry) >> 8: byte for byte, entry in enumerate(T0)}  # every high byte stands once in the table
+    found = [0xFFFF]
+    for _ in range(7):
+        byte = high[found[-1] >> 8]
+        found.append((found[-1] ^ int(T0[byte])) << 8 & 0xFF00 | byte)
+    return np.array(found, np.uint64)
+
+
+BEFORE = _before()
+
+
 class Index(NamedTuple):
     """Where each message of a log is, in the order of the file."""
 
@@ -71,11 +84,17 @@ def word(data, at):
 
 @kernel
 def crc_mcrf4xx(data, start, end, extra):
-    """CRC-16/MCRF4XX of data[start:end] followed by the byte `extra`."""
-    crc, low = np.uint64(0xFFFF), np.uint64(0xFF)
-    whole = end - start >> 3
-    for k in range(whole):
-        w = word(data, start + 8 * k) ^ crc
+    """CRC-16/MCRF4XX of data[start:end] followed by the byte `extra`; start >= 7, end > start.
+
+    Whole words only: zero bytes are put before the first, and the register begins where they lead to its usual 0xFFFF.
+    """
+    low = np.uint64(0xFF)
+    pad = start - end & 7
+    at = start - pad
+    gap = np.uint64(8 * pad)
+    w = word(data, at) >> gap << gap ^ BEFORE[pad]
+    crc = np.uint64(0)
+    while at < end:
         crc = np.uint64(
             T7[w & low]
             ^ T6[w >> np.uint64(8) & low]
@@ -86,8 +105,9 @@ def crc_mcrf4xx(data, start, end, extra):
             ^ T1[w >> np.uint64(48) & low]
             ^ T0[w >> np.uint64(56)]
         )
-    for i in range(start + 8 * whole, end):
-        crc = crc >> np.uint64(8) ^ np.uint64(T0[(crc ^ np.uint64(data[i])) & low])
+        at += 8
+        if at < end:
+            w = word(data, at) ^ crc
     return crc >> np.uint64(8) ^ np.uint64(T0[(crc ^ np.uint64(extra)) & low])
 
 

@@ -13,7 +13,7 @@ from mavquad.errors import LinkError
 from tests.oracles import flown
 from tools import watch_text
 from tools.watch import Request, Watch, angles_deg, body_rates, command_name, mode_name, path_error_m
-from tools.watch_feed import RATES_HZ, REQUESTER, SILENCE_S, Live, Playback
+from tools.watch_feed import RATES_HZ, REQUESTER, SILENCE_S, Live, Playback, Requester
 
 DATA = Path(__file__).parent.parent / "data"
 
@@ -122,8 +122,8 @@ def test_modes_and_commands_have_names():
 
 # ---- a log, played ------------------------------------------------------------------------------------------------------
 @pytest.fixture
-def played(tmp_path) -> Playback:
-    (tmp_path / "flight.tlog").write_bytes(flown.log_bytes(75.0))
+def played(tmp_path, request) -> Playback:
+    (tmp_path / "flight.tlog").write_bytes(flown.log_bytes(getattr(request, "param", 12.0)))
     return Playback(tmp_path / "flight.tlog")
 
 
@@ -137,11 +137,12 @@ def test_playing_in_steps_is_playing_at_once(played, tmp_path):
     assert list(played.watch.texts) == list(other.watch.texts)
 
 
+@pytest.mark.parametrize("played", [66.0], indirect=True)
 def test_a_seek_back_shows_what_was_to_be_seen_then(played, tmp_path):
     first = Playback(tmp_path / "flight.tlog")
-    first.seek(first.start_us + 70_000_000)
+    first.seek(first.start_us + 65_000_000)
     played.seek(played.end_us)
-    played.seek(played.start_us + 70_000_000)
+    played.seek(played.start_us + 65_000_000)
     assert watch_text.status(played.watch) == watch_text.status(first.watch)
     assert played.watch.bytes == first.watch.bytes
     assert [text.words for text in played.watch.texts] == [text.words for text in first.watch.texts]
@@ -156,11 +157,11 @@ def test_pause_and_step(played):
     assert played.watch.frames == frames + 1
     played.advance(10.0)
     assert played.watch.frames == frames + 1
-    assert played.status() == "flight.tlog 1.0/75.0 s paused"
+    assert played.status() == "flight.tlog 1.0/12.0 s paused"
     played.seek(10**18)
     assert played.over
     played.step()
-    assert played.status() == "flight.tlog 75.0/75.0 s end"
+    assert played.status() == "flight.tlog 12.0/12.0 s end"
 
 
 def test_a_recording_of_a_real_autopilot_is_played_through():
@@ -243,6 +244,22 @@ def test_rates_are_requested_only_when_asked_for_and_the_answers_shown(live):
     results = {wire.NAME[msgid]: request.result for msgid, request in feed.watch.vehicles[1].requests.items()}
     assert results["HIGHRES_IMU"] == "refused"
     assert sum(result == "granted" for result in results.values()) == len(RATES_HZ) - 2
+
+
+def test_a_rate_that_is_fast_enough_is_not_asked_for(live):
+    """A companion may live on it: a monitor never lowers a rate."""
+    feed, peer = live
+    for t_us, raw in flown.frames(3.0):
+        feed.watch.take(t_us, wire.split(raw)[0][0])
+    peer.send(b"\x00")
+    wait(feed, lambda: bool(feed._endpoint.peers))
+    requester = Requester(feed._endpoint)
+    for t_us, raw in flown.frames(12.0):
+        feed.watch.take(t_us + 3_000_000, wire.split(raw)[0][0])
+        requester.step(feed.watch)
+    asked = {int(message.param1) for frame, message in peer.listen() if frame.msgid == wire.ID["COMMAND_LONG"]}
+    assert wire.ID["HIGHRES_IMU"] in asked
+    assert not asked & {wire.ID["ATTITUDE_QUATERNION"], wire.ID["LOCAL_POSITION_NED"]}
 
 
 def test_silence_on_the_link_is_said_after_five_seconds(live, monkeypatch):
