@@ -21,7 +21,7 @@ import numpy.typing as npt
 from mavquad import signals
 from mavquad.airframe import Airframe
 from mavquad.errors import ConfigError
-from mavquad.estimate import gsmo_core, gsmo_implicit, gsmo_online, gsmo_relay, gsmo_stream, lie, torque
+from mavquad.estimate import gsmo_core, gsmo_implicit, gsmo_members, gsmo_online, gsmo_relay, gsmo_stream, lie, torque
 from mavquad.estimate.gsmo_online import Bank
 from mavquad.estimate.gsmo_stream import Counts
 from mavquad.quat import Quat, Vec3
@@ -153,7 +153,7 @@ def fixed_gains(params: Params, gyro: Vec3) -> gsmo_core.Fixed:
     quiet = (float(params.quiet_k1_rad_s), float(params.quiet_k2_rad_s2))
     relay = gsmo_relay.Gains(shape, params.order, group_map, False, k1, k2, *quiet, float(params.layer_rad), gyro)
     kind = IMPLICIT.get(params.variant, gsmo_implicit.RELAY)
-    implicit = gsmo_implicit.Gains(kind, group_map, k1, k2, float(params.L), gsmo_online.D_MAX, float(params.forget_s), gyro)
+    implicit = gsmo_implicit.Gains(kind, group_map, k1, k2, float(params.L), gsmo_members.D_MAX, float(params.forget_s), gyro)
     return gsmo_core.Fixed(params.variant in EXPLICIT, relay, implicit, float(params.tick_s))
 
 
@@ -228,7 +228,7 @@ def health(state: State, t_us: int) -> Health:
     noise_rad, member = math.nan, -1
     if state.bank:
         bank = Bank(*state.bank)
-        noise_rad, member = gsmo_online.noise_rad(bank), int(bank.best[1])
+        noise_rad, member = math.sqrt(max(float(bank.best[2]), 0.0)), int(bank.best[1])
     coasting = periods > gsmo_stream.GAP_PERIODS
     return Health(counts, age_s, period_s, coasting, periods > gsmo_core.STALE_PERIODS, settled, noise_rad, member)
 

@@ -35,9 +35,9 @@ def butterworth(cutoff_hz: float, dt_s: float) -> Butterworth:
 
 
 @kernel
-def butterworth_delay_s(cutoff_hz: float) -> float:
-    """Group delay at low frequency."""
-    return math.sqrt(2.0) / (2.0 * math.pi * cutoff_hz)
+def butterworth_delay_s(cutoff_hz: float, dt_s: float) -> float:
+    """Group delay at low frequency: sqrt(2)/(2 pi f), less what the prewarping takes away."""
+    return math.sqrt(0.5) * dt_s / math.tan(math.pi * cutoff_hz * dt_s)
 
 
 @kernel

@@ -44,6 +44,7 @@ def plan(scenarios: Sequence[str], configs: Sequence[str] | None, seeds: Sequenc
     if "8.3" in scenarios:
         jobs += [("tuned", m, seeds[:4], "") for m in tuned.METHODS if f"tuned {m}" in wanted]
         jobs += [("8.3", name, seeds, "") for name in named if name in wanted]
+        jobs += [("coloured", name, seeds[:4], "") for name in ("G9", "B2b", "online") if name in wanted]
     if "tumble" in scenarios:
         jobs += [("tumble", name, seeds[:4], "") for name in fast if name in wanted]
     for scenario in ("8.1", "8.2", "gap"):
@@ -71,6 +72,7 @@ def work(job: Job) -> list[Row]:
         "tuned": lambda: tuned.best(name, seeds),
         "maps": lambda: tables.maps(seeds),
         "bias law": tables.bias_law,
+        "coloured": lambda: tables.coloured_noise(setup.configurations()[name], seeds),
         "8.4": lambda: orders.integrator_order() + orders.norm_drift(),
         "8.5": orders.constant_spin,
         "recording": lambda: recording.judged(recording.read(Path(log))),

@@ -72,7 +72,11 @@ def multiply(a: Array, b: Array) -> Array:
 
 def noisy(q: Array, sigma_deg: float, rng: np.random.Generator) -> Array:
     """q with an independent Gaussian rotation vector on the body side, sigma per axis."""
-    phi = np.radians(sigma_deg) * rng.standard_normal((len(q), 3))
+    return turned_by(q, np.radians(sigma_deg) * rng.standard_normal((len(q), 3)))
+
+
+def turned_by(q: Array, phi: Array) -> Array:
+    """q (n,4) turned by rotation vectors phi (n,3) [rad] on the body side."""
     angle = np.linalg.norm(phi, axis=1, keepdims=True)
     return multiply(q, np.concatenate([np.cos(0.5 * angle), 0.5 * np.sinc(0.5 * angle / np.pi) * phi], axis=1))
 

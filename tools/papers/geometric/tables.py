@@ -179,6 +179,34 @@ def gaps(config: Config) -> list[Row]:
     return rows
 
 
+def coloured(source: Truth, tau_s: float, noise_deg: float, seed: int) -> setup.Stimulus:
+    """Samples whose noise fades with tau_s instead of being white; torque unknown."""
+    stimulus = setup.stimulus(source, torque_scale=0.0)
+    every = round(stimulus.period / source.h)
+    left = math.exp(-stimulus.period / tau_s)
+    white = math.radians(noise_deg) * np.random.default_rng(seed).standard_normal((len(source.t) // every + 1, 3))
+    phi = white.copy()
+    for k in range(1, len(phi)):
+        phi[k] = left * phi[k - 1] + math.sqrt(1.0 - left * left) * white[k]
+    return stimulus._replace(samples=setup.turned_by(source.q, np.repeat(phi, every, axis=0)[: len(source.t)]))
+
+
+def coloured_noise(config: Config, seeds: Sequence[int]) -> list[Row]:
+    """Beside 8.3: noise that can be predicted, and is partly taken for motion; torque unknown, t >= 1 s."""
+    source = setup.truth()
+    keep = after(source, 1.0)
+    rows = []
+    for noise_deg in (0.1, 0.5):
+        for tau_s in (0.05, 0.2, 1.0):
+            found = [
+                rms((run(config, coloured(source, tau_s, noise_deg, seed), IDENTITY, ZERO)[0] - source.w)[keep])
+                for seed in seeds
+            ]
+            more = {"noise_deg": noise_deg, "tau_s": tau_s, "torque": "unknown"}
+            rows.append(row("8.3", f"coloured: {config.name}", "raw_rms", "rad/s", float(np.mean(found)), **more))
+    return rows
+
+
 def tumble_configurations() -> list[Config]:
     """G2 and its order-1 kin with the sample held or moved along, the maps at order 1, and the better observers."""
     held = setup.explicit("order 1, held", "relay", 1, 4.0, 8.0)

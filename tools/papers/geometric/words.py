@@ -22,7 +22,7 @@ def column(r: Row) -> str:
     parts = [str(r["metric"])]
     if "torque" in r:
         parts.append({"known": "k", "unknown": "u"}.get(r["torque"], str(r["torque"])))
-    parts += [f"{r[key]:g}" for key in ("noise_deg", "h_s", "spin_rad_s") if key in r]
+    parts += [f"{r[key]:g}" for key in ("noise_deg", "tau_s", "h_s", "spin_rad_s") if key in r]
     return " ".join(parts)
 
 
