@@ -66,7 +66,7 @@ def init(gains: JointGains, z: ekf.Row12) -> JointState:
 
 
 @kernel
-def known_acceleration(model: ekf.EkfModel, eta: Vec3, v: Vec3, w: Vec3, thrust_m_s2: float, torque_nm: Vec3) -> np.ndarray:
+def known_acceleration(model: ekf.Vehicle, eta: Vec3, v: Vec3, w: Vec3, thrust_m_s2: float, torque_nm: Vec3) -> np.ndarray:
     """u + f of the six channels (6,): gravity, drag and applied thrust; applied torque and gyroscopic terms."""
     sf, cf = math.sin(eta[0]), math.cos(eta[0])
     st, ct = math.sin(eta[1]), math.cos(eta[1])

@@ -171,7 +171,7 @@ def init(gains: Gains) -> State:
 
 
 @kernel
-def known(model: ekf.EkfModel, q: Quat, thrust_m_s2: float, v: Vec3) -> Vec3:
+def known(model: ekf.Vehicle, q: Quat, thrust_m_s2: float, v: Vec3) -> Vec3:
     """g e3 - T R e3 - drag v."""
     up = quat.rotate(q, (0.0, 0.0, thrust_m_s2))
     d = model.drag_1_s
@@ -190,8 +190,8 @@ def carry(
     else:
         q = quat.integrate(state.q_wxyz, state.omega_rad_s, dt_s)
         ahead = ekf.EkfState(state.p_ned_m, state.v_ned_m_s, q, state.omega_rad_s, state.P, state.singular)
-    a = axpy(0.5, known(gains.model, state.q_wxyz, thrust_m_s2, v), (0.0, 0.0, 0.0))
-    a = axpy(0.5, known(gains.model, ahead.q_wxyz, thrust_m_s2, v), axpy(1.0, a, fast))
+    a = axpy(0.5, known(gains, state.q_wxyz, thrust_m_s2, v), (0.0, 0.0, 0.0))
+    a = axpy(0.5, known(gains, ahead.q_wxyz, thrust_m_s2, v), axpy(1.0, a, fast))
     moved = axpy(0.5 * dt_s * dt_s, a, axpy(dt_s, axes.gained_m_s, axes.moved_m))
     return ahead, Axes(axes.z1, axes.z2, axes.z3, axes.rate, moved, axpy(dt_s, a, axes.gained_m_s))
 
@@ -304,7 +304,7 @@ def _position(gains: Gains, state: State, sample: Position) -> State:
         return state
     x = state.axes
     speed = state.ekf.v_ned_m_s if gains.use_filter else axpy(1.0, x.gained_m_s, x.z2)
-    thrust = known(gains.ekf.model, state.ekf.q_wxyz, state.thrust_m_s2, speed)
+    thrust = known(gains.ekf, state.ekf.q_wxyz, state.thrust_m_s2, speed)
     a = axpy(1.0, thrust, axpy(1.0, x.z3, state.fast_m_s2))
     p = axpy(age_s, speed, p)  # the sample carried forward to the filter's time
     v = axpy(age_s, a, v)
@@ -329,7 +329,7 @@ def _placed(gains: Gains, state: State, sample: Position) -> State:
     t_us = max(state.t_us, sample.t_us)
     P = state.ekf.P.copy()
     P[:6, :] = P[:, :6] = 0.0
-    P[range(6), range(6)] = gains.ekf.p0[:6]
+    P[range(6), range(6)] = gains.ekf.noise[ekf.P0, :6]
     moved = state.ekf._replace(p_ned_m=sample.p_ned_m, v_ned_m_s=v, P=P)
     axes = Axes(sample.p_ned_m, v, state.axes.z3, ZERO3, ZERO3, ZERO3)
     return state._replace(t_us=t_us, ekf=moved, axes=axes, axes_us=t_us, position_us=sample.t_us, offset_m=ZERO3)
@@ -352,8 +352,8 @@ def _imu(gains: Gains, state: State, sample: Imu) -> State:
             state = state._replace(ekf=state.ekf._replace(omega_rad_s=sample.gyro_rad_s))
     if gains.accel_tau_s > 0.0 and state.position_us and finite3(sample.accel_m_s2):
         speed = state.ekf.v_ned_m_s
-        felt = axpy(1.0, quat.rotate(state.ekf.q_wxyz, sample.accel_m_s2), (0.0, 0.0, gains.ekf.model.gravity_m_s2))
-        rest = axpy(-1.0, known(gains.ekf.model, state.ekf.q_wxyz, state.thrust_m_s2, speed), felt)
+        felt = axpy(1.0, quat.rotate(state.ekf.q_wxyz, sample.accel_m_s2), (0.0, 0.0, gains.ekf.gravity_m_s2))
+        rest = axpy(-1.0, known(gains.ekf, state.ekf.q_wxyz, state.thrust_m_s2, speed), felt)
         since_s = 1e-6 * (sample.t_us - state.imu_us) if state.imu_us else 0.0
         w = 1.0 - math.exp(-min(since_s, _COAST_S) / gains.accel_tau_s)
         state = state._replace(fast_m_s2=axpy(w, axpy(-1.0, state.fast_m_s2, rest), state.fast_m_s2))
@@ -374,7 +374,7 @@ def step(gains: Gains, state: State, applied: Applied, t_us: int) -> tuple[State
         p = axpy(1.0, axpy(0.5 * since_s * since_s, x.z3, x.moved_m), axpy(since_s, x.z2, x.z1))
         v = axpy(1.0, axpy(since_s, x.z3, x.gained_m_s), x.z2)
     f = compensated(x, gains.w0, gains.feedforward, gains.lead_s, gains.butterworth)
-    f = axpy(-gains.ekf.model.drag_1_s, v, axpy(1.0, f, state.fast_m_s2))
+    f = axpy(-gains.ekf.drag_1_s, v, axpy(1.0, f, state.fast_m_s2))
     return state, Estimate(t_us, p, v, q, w, f, NAN3, state.thrust.delay_s, state.thrust_m_s2)
 
 

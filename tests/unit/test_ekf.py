@@ -33,7 +33,7 @@ def noisy_flight(n, seed, keep=1.0):
         u = (9.8 + np.sin(0.01 * k), back, 0.1 * rng.standard_normal(3), rng.standard_normal(3))
         inputs.append(u)
         x = oracle.rk4(x, DT, *u, MODEL.gravity_m_s2, MODEL.drag_1_s, MODEL.inertia_kg_m2, MODEL.rate_drag_nm_s)
-        z = x + np.sqrt(G.r) * rng.standard_normal(12)
+        z = x + np.sqrt(G.noise[ekf.R]) * rng.standard_normal(12)
         rows.append(np.where(rng.random(12) < keep, z, np.nan))
     return inputs, rows
 
@@ -46,7 +46,7 @@ def as_input(u):
 def test_the_filter_agrees_with_filterpy_over_a_whole_noisy_flight(n, keep):
     inputs, rows = noisy_flight(n, seed=3, keep=keep)
     state = ekf.init(G, (0.0,) * 12)
-    peer = oracle.Filter(np.zeros(12), G.p0, G.q, G.r, DT, tuple(MODEL))
+    peer = oracle.Filter(np.zeros(12), G.noise[ekf.P0], G.noise[ekf.Q], G.noise[ekf.R], DT, tuple(MODEL))
     tilt = 0.0
     for u, z in zip(inputs, rows, strict=True):
         state = ekf.step(G, state, as_input(u), tuple(z), DT)

@@ -27,6 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     common.add_arguments(parser, seeds="1-5")
     parser.add_argument("--scenario", help=f"some of {', '.join(SCENARIOS + EXTRA)} (default: all but step15)")
     parser.add_argument("--config", help="some configurations, by name, with commas (default: all)")
+    parser.add_argument("--speed", action="store_true", help="only the time that filter, observers and a run take")
     parser.add_argument("--bandwidths", action="store_true", help="also ADRC and IADRC-R without feed-forward at other w0")
 
 
@@ -64,6 +65,8 @@ def fly(job: Job) -> list[common.Row]:
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.speed:
+        return _speed(args.json)
     seeds = common.parse_seeds(args.seeds)
     todo = jobs(args.scenario, args.config, seeds, args.bandwidths)
     rows: list[common.Row] = []
@@ -82,6 +85,17 @@ def run(args: argparse.Namespace) -> int:
         common.print_json("iadrc", [_plain(r) for r in rows + middle])
     else:
         print(table(middle))
+    return 0
+
+
+def _speed(as_json: bool) -> int:
+    from tools.papers.joint_observer import speed
+
+    rows = speed.measure()
+    if as_json:
+        common.print_json("iadrc", rows)
+    else:
+        print("\n".join(f"{r['metric']:12} {r['value']:8.3f} {r['unit']}" for r in rows))
     return 0
 
 

@@ -28,7 +28,7 @@ def init(gains: AugmentedGains, z: ekf.Row12) -> AugmentedState:
     state = ekf.init(gains.ekf, z)
     P = np.zeros((18, 18))
     for i in range(12):
-        P[i, i] = gains.ekf.p0[i]
+        P[i, i] = gains.ekf.noise[ekf.P0, i]
         if i < 6:
             P[12 + i, 12 + i] = gains.p0_disturbance
     return AugmentedState(state, np.zeros(6), P)
@@ -39,7 +39,7 @@ def step(
     gains: AugmentedGains, state: AugmentedState, thrust_m_s2: float, torque_nm: ekf.Vec3, z: ekf.Row12, dt_s: float
 ) -> AugmentedState:
     """Predict over dt under the applied input and the present disturbance, then absorb z (NaN rows left out)."""
-    model, s, d = gains.ekf.model, state.ekf, state.d
+    model, s, d = gains.ekf, state.ekf, state.d
     u = (thrust_m_s2, torque_nm, (d[0], d[1], d[2]), (d[3], d[4], d[5]))
     A = np.zeros((18, 18))
     ekf.jacobian(model, thrust_m_s2, quat.to_euler(s.q_wxyz), s.omega_rad_s, A)
@@ -49,7 +49,7 @@ def step(
     p, v, q, w = ekf.motion(model, u, s.p_ned_m, s.v_ned_m_s, s.q_wxyz, s.omega_rad_s, dt_s)
     P = ekf.spread(ekf.transition(A, dt_s), state.P)
     for i in range(12):
-        P[i, i] += gains.ekf.q[i] * dt_s
+        P[i, i] += gains.ekf.noise[ekf.Q, i] * dt_s
     for i in range(12, 18):
         P[i, i] += gains.q_disturbance * dt_s
     eta = quat.to_euler(q)
@@ -60,7 +60,7 @@ def step(
         if 6 <= i < 9:
             residual = ekf.wrap(residual)
         if math.isfinite(residual):
-            ekf.absorb(P, dx, i, residual, gains.ekf.r[i], scratch)
+            ekf.absorb(P, dx, i, residual, gains.ekf.noise[ekf.R, i], scratch)
     moved = ekf.EkfState(
         (p[0] + dx[0], p[1] + dx[1], p[2] + dx[2]),
         (v[0] + dx[3], v[1] + dx[4], v[2] + dx[5]),

@@ -68,7 +68,7 @@ def fly(
 ) -> Run:
     """Fly the whole scenario from rest at the origin."""
     n = noise.shape[0]
-    body, model = law.body, gains.ekf.model
+    body, model = law.body, gains.ekf
     run = Run(np.empty((n, 12)), np.empty((n, 12)), np.empty((n, 6)), np.empty((n, 4)), np.empty((n, 3)))
     hover = 0.25 * plant.body.mass_kg * plant.body.gravity_m_s2
     x = Truth((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), quat.IDENTITY, (0.0, 0.0, 0.0), (hover, hover, hover, hover))
