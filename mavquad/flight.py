@@ -55,6 +55,7 @@ class Flight:
     tuned: Plan | None  # the plan with the gains as changed in flight
     delay_echo_s: float  # from a setpoint sent to its echo in ATTITUDE_TARGET; NaN: never recognised
     setpoints: tuple[tuple[int, float, float], ...]  # the last ones sent: vehicle time, first two vector parts
+    own_attitude_loop: bool | None  # body rates are sent, not attitudes; None: not said yet
     outbox: list[tuple[int, bytes]]
     trace: list[tuple[float, ...]]
 
@@ -103,5 +104,6 @@ def forget(plan: Plan, f: Flight) -> None:
     f.position, f.offset_m, f.origin_m, f.estimate = None, ZERO3, ZERO3, None
     f.anchor_p_m, f.anchor_yaw_rad = ZERO3, 0.0
     f.delay_echo_s, f.setpoints = math.nan, ()
+    f.own_attitude_loop = None
     f.sent, f.echo, f.applied_thrust_m_s2 = None, None, G_M_S2
     f.lateness_us, f.late_us = 1 << 62, 0

@@ -490,6 +490,7 @@ def _control(plan: Plan, f: Flight, t_us: int, dt_s: float) -> None:
         _position_setpoint(plan, f, demand)
     elif active:
         bits = _put(plan, f, _setpoint(plan, f, command), dt_s)
+        _say_which_loop(plan, f, command)
         if t_us >= f.path_t0_us + round(1e6 * plan.path.duration_s) + 1_000_000 and f.life.state == ENGAGED:
             f.life = f.life._replace(ended=True)
     if (
@@ -515,6 +516,17 @@ def _setpoint(plan: Plan, f: Flight, command: Command) -> Setpoint:
         if mask == 0 and f.life.autopilot == lifecycle.ARDUPILOT:
             omega = _unrotate(q, omega)
     return Setpoint(q, omega, f.hover_thrust * specific / G_M_S2, mask)
+
+
+def _say_which_loop(plan: Plan, f: Flight, command: Command) -> None:
+    """With body rates asked for: whose attitude loop flies, whenever that changes. A late link leaves it to the autopilot."""
+    if plan.settings.loop != "rates":
+        return
+    ours = math.isfinite(command.omega_rad_s[0])
+    if ours != f.own_attitude_loop:
+        f.own_attitude_loop = ours
+        words = "attitude loop closed here" if ours else f"delay {1e3 * f.delay_s:.0f} ms: autopilot's attitude loop"
+        _send(plan, f, "STATUSTEXT", lifecycle.text(f"mavquad: {words}", 6 if ours else 4)[1])
 
 
 def _unrotate(q: tuple[float, float, float, float], w: Vec3) -> Vec3:

@@ -113,7 +113,9 @@ def build(settings: Companion, airframe: Airframe | None = None) -> Plan:
         stage("compensator", settings.compensator, COMPENSATORS, tune, airframe) if settings.compensator != "none" else None
     )
     estimator_stage = stage("estimator", estimator, ESTIMATORS, tune, airframe)
-    controller_stage = stage("controller", settings.controller, {settings.controller: module}, tune, airframe)
+    controller_stage = stage(
+        "controller", settings.controller, {settings.controller: module}, _with_loop(settings, module), airframe
+    )
     return Plan(
         settings,
         airframe,
@@ -127,6 +129,16 @@ def build(settings: Companion, airframe: Airframe | None = None) -> Plan:
         _samples((estimator_stage, controller_stage, compensator, *observers)),
         publish.trace_names(tuple(s.label for s in observers), compensator.module if compensator else None),
     )
+
+
+def _with_loop(settings: Companion, module: str) -> dict[str, dict[str, Any]]:
+    """The tuning, told which loop is to be closed here where the controller can close it. Raises ConfigError where it cannot."""
+    known = [f.name for f in dataclass_fields(importlib.import_module(module).Params)]
+    if settings.loop == "attitude":
+        return settings.tune
+    if "loop" not in known:
+        raise ConfigError(f"loop = rates: {settings.controller} closes no attitude loop; use iadrc or adrc, or loop = attitude")
+    return {**settings.tune, settings.controller: {"loop": settings.loop, **settings.tune.get(settings.controller, {})}}
 
 
 _ALWAYS = ("ATTITUDE_QUATERNION", "ATTITUDE", "LOCAL_POSITION_NED", "ATTITUDE_TARGET")

@@ -22,6 +22,7 @@ class Params:
     wc_rad_s: float = 0.0
     drag_feed_forward: float = 1.0
     tilt_max_deg: float = 35.0
+    loop: str = "attitude"
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.wc_rad_s) and 0.0 <= self.wc_rad_s <= 20.0):
@@ -39,6 +40,7 @@ def gains(params: Params, airframe: Airframe) -> Gains:
             jerk_feed_forward=0.0,
             drag_feed_forward=params.drag_feed_forward,
             tilt_max_deg=params.tilt_max_deg,
+            loop=params.loop,
         ),
         airframe,
     )

@@ -15,15 +15,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+
 from mavquad import quat
 from mavquad.airframe import Airframe
 from mavquad.control.iadrc import position_law
+from mavquad.control.lagged import G_M_S2, Vehicle, ahead, drag_along, limited, response, thrust_acceleration
 from mavquad.errors import ConfigError
 from mavquad.jit import kernel
 from mavquad.linalg import axpy, clip, finite3
 from mavquad.signals import NAN3, ZERO3, Command, Demand, Estimate, Quat, Vec3
 
-G_M_S2 = 9.80665
 _QUEUE = 64  # commands remembered
 RATES_DELAY_S = 0.02  # above this the attitude loop belongs to the autopilot
 
@@ -43,7 +45,8 @@ class Params:
     tilt_max_deg: float = 35.0
     f_max_m_s2: float = 8.0
     delay_max_s: float = 0.4
-    attitude_rad_s: float = 0.0  # > 0: bandwidth of our own attitude loop, which sends body rates
+    loop: str = "attitude"  # rates: the attitude loop is closed here too, and body rates are sent
+    attitude_rad_s: float = 0.0  # its bandwidth
 
     def __post_init__(self) -> None:
         if not (0.0 <= self.wc_xy_rad_s <= 20.0 and 0.0 <= self.wc_z_rad_s <= 20.0 and 1.0 <= self.quicken <= 4.0):
@@ -61,41 +64,32 @@ class Params:
                 f"iadrc: jerk_feed_forward = {self.jerk_feed_forward}, drag_feed_forward = {self.drag_feed_forward}:"
                 " expected 0 to 2"
             )
+        if self.loop not in ("attitude", "rates"):
+            raise ConfigError(f'iadrc.loop = "{self.loop}": expected attitude or rates')
         if not (5.0 <= self.tilt_max_deg <= 60.0 and 0.0 < self.f_max_m_s2 <= 30.0 and 0.0 <= self.attitude_rad_s <= 40.0):
             raise ConfigError(
                 f"iadrc: tilt_max_deg = {self.tilt_max_deg}, f_max_m_s2 = {self.f_max_m_s2}, attitude_rad_s ="
-                f" {self.attitude_rad_s}: expected 5 to 60, 0 to 30 and 0 (off) to 40"
+                f" {self.attitude_rad_s}: expected 5 to 60, 0 to 30 and 0 (from the airframe) to 40"
             )
 
 
 class Gains(NamedTuple):
     wc: Vec3
     quicken: Vec3
-    lag_s: Vec3
+    vehicle: Vehicle
     delay_s: float
     predict: bool
     jerk: float
-    drag_linear_1_s: Vec3
-    drag_quadratic_1_m: Vec3
     drag: float
-    tan_tilt: float
     f_max: float
     delay_max_s: float
-    attitude_rad_s: float
+    attitude_rad_s: float  # 0: the autopilot's loop
 
 
 class State(NamedTuple):
-    """Commands sent, oldest first: (vehicle time [s], thrust acceleration)."""
+    """queue (QUEUE, 4): vehicle time [s] and command, oldest first."""
 
-    queue: tuple[tuple[float, Vec3], ...]
-
-
-def response(airframe: Airframe, lag_s: float = -1.0, delay_s: float = -1.0) -> tuple[float, float]:
-    """(lag, delay) of the first-order response with the mean delay and the spread of the airframe's second-order one."""
-    a = airframe.attitude
-    mean = 2.0 * a.damping / a.natural_frequency_rad_s
-    spread = math.sqrt(max(mean * mean - 2.0 / a.natural_frequency_rad_s**2, 0.16 * mean * mean))
-    return (lag_s if lag_s >= 0.0 else spread), (delay_s if delay_s >= 0.0 else a.delay_s + mean - spread)
+    queue: np.ndarray
 
 
 def gains(params: Params, airframe: Airframe) -> Gains:
@@ -109,18 +103,28 @@ def gains(params: Params, airframe: Airframe) -> Gains:
     return Gains(
         wc=(wc_xy, wc_xy, wc_z),
         quicken=(params.quicken, params.quicken, 1.0),
-        lag_s=(max(lag_s, 2e-3), max(lag_s, 2e-3), max(lag_z, 2e-3)),
+        vehicle=Vehicle(
+            lag_s=max(lag_s, 2e-3),
+            lag_down_s=max(lag_z, 2e-3),
+            drag_linear_1_s=(k * linear[0], k * linear[1], k * linear[2]),
+            drag_quadratic_1_m=(k * quadratic[0], k * quadratic[1], k * quadratic[2]),
+            tan_tilt=math.tan(math.radians(params.tilt_max_deg)),
+            down_min_m_s2=0.25 * G_M_S2,
+            down_max_m_s2=1.7 * G_M_S2,
+        ),
         delay_s=delay_s,
         predict=params.predict,
         jerk=params.jerk_feed_forward,
-        drag_linear_1_s=(k * linear[0], k * linear[1], k * linear[2]),
-        drag_quadratic_1_m=(k * quadratic[0], k * quadratic[1], k * quadratic[2]),
         drag=params.drag_feed_forward,
-        tan_tilt=math.tan(math.radians(params.tilt_max_deg)),
         f_max=params.f_max_m_s2,
         delay_max_s=params.delay_max_s,
-        attitude_rad_s=params.attitude_rad_s,
+        attitude_rad_s=(params.attitude_rad_s or own_attitude(airframe)) if params.loop == "rates" else 0.0,
     )
+
+
+def own_attitude(airframe: Airframe) -> float:
+    """The attitude gain [1/s] that makes the airframe's response of a rate loop with its natural frequency and damping."""
+    return 0.5 * airframe.attitude.natural_frequency_rad_s / airframe.attitude.damping
 
 
 def bandwidth(lag_s: float, delay_s: float, quicken: float) -> float:
@@ -129,74 +133,28 @@ def bandwidth(lag_s: float, delay_s: float, quicken: float) -> float:
 
 
 def init(gains: Gains) -> State:
-    return State(())
-
-
-@kernel
-def drag_along(linear: Vec3, quadratic: Vec3, v: Vec3) -> Vec3:
-    """Acceleration by still-air drag at the velocity v (the airframe's two horizontal coefficients are alike)."""
-    speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
-    return (
-        -(linear[0] + quadratic[0] * speed) * v[0],
-        -(linear[1] + quadratic[1] * speed) * v[1],
-        -(linear[2] + quadratic[2] * speed) * v[2],
-    )
-
-
-@kernel
-def lagged(p: Vec3, v: Vec3, a: Vec3, u: Vec3, rest: Vec3, lag_s: Vec3, h: float) -> tuple[Vec3, Vec3, Vec3]:
-    """(p, v, a) after h of a constant command u: v' = a + rest, a' = (u - a)/lag. Exact."""
-    p2, v2, a2 = [0.0] * 3, [0.0] * 3, [0.0] * 3
-    for i in range(3):
-        keep = math.exp(-h / lag_s[i])
-        gap, fall = a[i] - u[i], lag_s[i] * (1.0 - keep)
-        p2[i] = p[i] + h * v[i] + 0.5 * h * h * (u[i] + rest[i]) + gap * lag_s[i] * (h - fall)
-        v2[i] = v[i] + h * (u[i] + rest[i]) + gap * fall
-        a2[i] = u[i] + keep * gap
-    return (p2[0], p2[1], p2[2]), (v2[0], v2[1], v2[2]), (a2[0], a2[1], a2[2])
-
-
-def underway(
-    state: State, p: Vec3, v: Vec3, a: Vec3, rest: Vec3, lag_s: Vec3, now_s: float, delay_s: float
-) -> tuple[Vec3, Vec3, Vec3]:
-    """(p, v, a) delay_s from now: each command takes over delay_s after it was sent."""
-    at = now_s
-    u = a if not state.queue else state.queue[0][1]
-    for sent_s, command in state.queue:
-        takes_over = sent_s + delay_s
-        if takes_over <= now_s:
-            u = command
-            continue
-        p, v, a = lagged(p, v, a, u, rest, lag_s, takes_over - at)
-        at, u = takes_over, command
-    return lagged(p, v, a, u, rest, lag_s, max(0.0, now_s + delay_s - at))
+    queue = np.zeros((_QUEUE, 4))
+    queue[:, 0] = -1e9
+    return State(queue)
 
 
 @kernel
 def law(
-    g: Gains, p: Vec3, v: Vec3, a: Vec3, f_rest: Vec3, p_ref: Vec3, v_ref: Vec3, a_ref: Vec3, j_ref: Vec3
+    g: Gains, p: Vec3, v: Vec3, a: Vec3, rest: Vec3, p_ref: Vec3, v_ref: Vec3, a_ref: Vec3, j_ref: Vec3
 ) -> tuple[Vec3, Vec3]:
-    """(thrust acceleration g e3 - T R e3 wanted, the disturbance it cancels)."""
-    along = drag_along(g.drag_linear_1_s, g.drag_quadratic_1_m, v_ref)
-    felt = drag_along(g.drag_linear_1_s, g.drag_quadratic_1_m, v)
-    air = axpy(g.drag, along, axpy(1.0 - g.drag, felt, (0.0, 0.0, 0.0)))
-    cancelled = axpy(1.0, f_rest, air)
+    """(thrust acceleration g e3 - T R e3 wanted, the disturbance it cancels): Eq. (31), then the lag made up for."""
+    x = g.vehicle
+    along, along_rate = drag_along(x.drag_linear_1_s, x.drag_quadratic_1_m, v_ref, a_ref)
+    felt, _ = drag_along(x.drag_linear_1_s, x.drag_quadratic_1_m, v, a_ref)
+    cancelled = axpy(g.drag, along, axpy(1.0 - g.drag, felt, rest))
     wanted = position_law(g.wc, p, v, cancelled, p_ref, v_ref, a_ref)
-    x = (
-        wanted[0] + (g.quicken[0] - 1.0) * (wanted[0] - a[0]) + g.jerk * g.lag_s[0] * j_ref[0],
-        wanted[1] + (g.quicken[1] - 1.0) * (wanted[1] - a[1]) + g.jerk * g.lag_s[1] * j_ref[1],
-        wanted[2] + (g.quicken[2] - 1.0) * (wanted[2] - a[2]) + g.jerk * g.lag_s[2] * j_ref[2],
-    )
-    return x, cancelled
-
-
-@kernel
-def limited(tan_tilt: float, a: Vec3) -> Vec3:
-    """The acceleration of a thrust vector that the vehicle may have: vertical first, then the cone."""
-    down = clip(G_M_S2 - a[2], 0.25 * G_M_S2, 1.7 * G_M_S2)
-    size, most = math.sqrt(a[0] * a[0] + a[1] * a[1]), down * tan_tilt
-    k = most / size if size > most else 1.0
-    return (k * a[0], k * a[1], G_M_S2 - down)
+    k, k_down = g.jerk * x.lag_s, g.jerk * x.lag_down_s
+    slope = axpy(-g.drag, along_rate, j_ref)
+    return (
+        wanted[0] + (g.quicken[0] - 1.0) * (wanted[0] - a[0]) + k * slope[0],
+        wanted[1] + (g.quicken[1] - 1.0) * (wanted[1] - a[1]) + k * slope[1],
+        wanted[2] + (g.quicken[2] - 1.0) * (wanted[2] - a[2]) + k_down * slope[2],
+    ), cancelled
 
 
 @kernel
@@ -227,20 +185,21 @@ def step(
     p, v, q = estimate.p_ned_m, estimate.v_ned_m_s, estimate.q_wxyz
     now_s = 1e-6 * estimate.t_us
     f = estimate.f_ned_m_s2 if finite3(estimate.f_ned_m_s2) else ZERO3
-    felt = drag_along(gains.drag_linear_1_s, gains.drag_quadratic_1_m, v)
+    felt, _ = drag_along(gains.vehicle.drag_linear_1_s, gains.vehicle.drag_quadratic_1_m, v, ZERO3)
     most = gains.f_max
     rest = (clip(f[0] - felt[0], -most, most), clip(f[1] - felt[1], -most, most), clip(f[2] - felt[2], -most, most))
-    thrust = estimate.thrust_m_s2 if math.isfinite(estimate.thrust_m_s2) else G_M_S2
-    up = quat.rotate(q, (0.0, 0.0, thrust))
-    a = (-up[0], -up[1], G_M_S2 - up[2])
+    a = thrust_acceleration(q, estimate.thrust_m_s2 if math.isfinite(estimate.thrust_m_s2) else G_M_S2)
+    late_s = estimate.delay_s if math.isfinite(estimate.delay_s) else 0.0
     if gains.predict:
-        delay_s = min(gains.delay_max_s, gains.delay_s + max(0.0, estimate.delay_s))
-        p, v, a = underway(state, p, v, a, axpy(1.0, felt, rest), gains.lag_s, now_s, delay_s)
+        delay_s = min(gains.delay_max_s, gains.delay_s + max(0.0, late_s))
+        p, v, a = ahead(gains.vehicle, p, v, a, rest, state.queue, now_s, delay_s)
         demand = preview(estimate.t_us + round(1e6 * delay_s))
     wanted, cancelled = law(gains, p, v, a, rest, demand.p_ned_m, demand.v_ned_m_s, demand.a_ned_m_s2, demand.j_ned_m_s3)
-    command = limited(gains.tan_tilt, wanted)
+    command = limited(gains.vehicle, wanted)
     omega = NAN3
-    if gains.attitude_rad_s > 0.0 and estimate.delay_s <= RATES_DELAY_S:
+    if gains.attitude_rad_s > 0.0 and late_s <= RATES_DELAY_S:
         omega = body_rates(q, command, demand.yaw_rad, gains.attitude_rad_s)
-    queue = (*state.queue[1 - _QUEUE :], (now_s, command))
+    queue = np.empty_like(state.queue)
+    queue[:-1] = state.queue[1:]
+    queue[-1] = now_s, *command
     return State(queue), Command(command, demand.yaw_rad, demand.yaw_rate_rad_s, omega, cancelled)

@@ -1,6 +1,6 @@
-"""The flown MPC's model and law as kernels: a thrust acceleration that follows its command with a lag, drag, limits, rates.
+"""The flown model of `mpc_flight.py` and `iadrc_flight.py`, and the MPC's law, as kernels: lagged thrust acceleration, drag, limits.
 
-States of an axis are p, v and the thrust acceleration a with a' = (u - a)/tau; `mpc_flight.py` makes the gains and runs the steps.
+States of an axis are p, v and the thrust acceleration a with a' = (u - a)/tau; the flight faces make the gains and run the steps.
 """
 
 import math
@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mavquad import quat
+from mavquad.airframe import Airframe
 from mavquad.jit import kernel
 from mavquad.signals import Quat, Vec3
 
@@ -36,6 +37,26 @@ class Law(NamedTuple):
     slew_m_s3: float
 
 
+class Vehicle(NamedTuple):
+    """The part of it that says how the vehicle answers and what it may do, for a law of another kind."""
+
+    lag_s: float
+    lag_down_s: float
+    drag_linear_1_s: Vec3
+    drag_quadratic_1_m: Vec3
+    tan_tilt: float
+    down_min_m_s2: float
+    down_max_m_s2: float
+
+
+def response(airframe: Airframe, lag_s: float, delay_s: float) -> tuple[float, float]:
+    """(lag, delay) of a first-order response with the mean delay and spread of the airframe's second-order one; >= 0 wins."""
+    a = airframe.attitude
+    mean = 2.0 * a.damping / a.natural_frequency_rad_s
+    spread = math.sqrt(max(mean * mean - 2.0 / a.natural_frequency_rad_s**2, (0.4 * mean) ** 2))
+    return (lag_s if lag_s >= 0.0 else spread), (delay_s if delay_s >= 0.0 else a.delay_s + mean - spread)
+
+
 @kernel
 def drag_along(linear: Vec3, quadratic: Vec3, v: Vec3, a: Vec3) -> tuple[Vec3, Vec3]:
     """Acceleration by drag at the velocity v, and its rate of change under the acceleration a."""
@@ -53,7 +74,7 @@ def drag_along(linear: Vec3, quadratic: Vec3, v: Vec3, a: Vec3) -> tuple[Vec3, V
 
 @kernel
 def ahead(
-    g: Law, p: Vec3, v: Vec3, a: Vec3, rest: Vec3, queue: np.ndarray, now_s: float, delay_s: float
+    g: Law | Vehicle, p: Vec3, v: Vec3, a: Vec3, rest: Vec3, queue: np.ndarray, now_s: float, delay_s: float
 ) -> tuple[Vec3, Vec3, Vec3]:
     """(p, v, a) after delay_s: each command acts delay_s after its stamp, the acceleration follows it with the lag.
 
@@ -101,7 +122,7 @@ def _piece(p, v, a, u, f, h, lag_s, keep):
 
 
 @kernel
-def limited(g: Law, u: Vec3) -> Vec3:
+def limited(g: Law | Vehicle, u: Vec3) -> Vec3:
     """Vertical first, then the horizontal part into the cone: the acceleration of a thrust vector that the vehicle may have."""
     down = min(g.down_max_m_s2, max(g.down_min_m_s2, G_M_S2 - u[2]))
     north, east = u[0], u[1]

@@ -33,6 +33,7 @@ from mavquad.control.lagged import (
     grown,
     limited,
     path_part,
+    response,
     slewed,
     thrust_acceleration,
     turning,
@@ -110,14 +111,6 @@ class State(NamedTuple):
     axis: Vec3  # NaN before the first command
     programs: constrained.State | None
     steps: int
-
-
-def response(airframe: Airframe, lag_s: float, delay_s: float) -> tuple[float, float]:
-    """(lag, delay) of a first-order response with the mean delay and spread of the airframe's second-order one."""
-    a = airframe.attitude
-    mean = 2.0 * a.damping / a.natural_frequency_rad_s
-    spread = math.sqrt(max(mean * mean - 2.0 / a.natural_frequency_rad_s**2, (0.4 * mean) ** 2))
-    return (lag_s if lag_s >= 0.0 else spread), (delay_s if delay_s >= 0.0 else a.delay_s + mean - spread)
 
 
 def gains(params: Params, airframe: Airframe) -> Gains:

@@ -69,9 +69,7 @@ def test_bench():
 
 def test_latency_is_survived_with_the_delayed_input_and_not_without():
     assert median("S4-latency", "IADRC-R latency 60ms delayed u")["quiet_rms"] <= 0.10
-    assert median("S4-latency", "ADRC latency 60ms delayed u")["quiet_rms"] <= 0.15
     assert median("S4-latency", "ADRC latency 40ms")["quiet_rms"] > 2.0
-    assert median("S4-latency", "IADRC-R latency 40ms")["quiet_rms"] > 2.0
 
 
 def test_a_step_of_15_m_overshoots_by_centimetres_and_by_metres_when_the_observer_is_told_the_wish():
