@@ -298,6 +298,7 @@ class Companion:
         latency = sorted(self.latency_us) or [math.nan]
         edges = [10.0 ** (1.0 + k / 8.0) for k in range(33)]  # 10 us to 0.1 s
         target = self.sources.get(life.target)
+        diagnose = getattr(self.plan.controller.module, "diagnostics", None)
         return {
             "state": life.state,
             "reason": life.reason,
@@ -310,6 +311,7 @@ class Companion:
             "interventions": self.flight.interventions,
             "hover_thrust": self.flight.hover_thrust,
             "delay_s": self.flight.delay_s,
+            "controller": diagnose(self.flight.controller) if diagnose else {},
             "rates_hz": {r.name: r.granted_hz for r in life.rates},
             "latency_us": {
                 "p50": latency[len(latency) // 2],

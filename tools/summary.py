@@ -60,6 +60,7 @@ def summarise(run: Path, name: str, resolved: Resolved, flown: Flown, command: s
         "states": said.get("states", []),
         "granted_hz": said.get("rates_hz"),
         "delay_s": said.get("delay_s"),
+        "solver": said.get("controller") or {},
         "landed": bool(sitl.get("landed", False)),
     }
     failures = failures or _failures(result, resolved, lockstep)

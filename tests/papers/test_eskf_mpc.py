@@ -146,3 +146,13 @@ def test_an_unknown_name_is_refused_with_the_known_ones():
         eskf_mpc.plan("S9", "", [1])
     with pytest.raises(common.ConfigError, match="LADRC"):
         configs.pick(configs.CONFIGS, "PC", "config")
+
+
+def test_the_page_shows_tables_claims_and_figures():
+    from tools.papers import eskf_mpc_page
+
+    rows = [row for config in ("default", "PB") for row in eskf_mpc.job_rows(("S1-B", config, 101))]
+    page = eskf_mpc_page.page_of(rows + eskf_mpc.summary(rows), 101)
+    for words in ("What reproduces", "Figure 4", "Figure 10", "the default over the printed method"):
+        assert words in page
+    assert len(page) < 8e6

@@ -1,7 +1,7 @@
 """mavquad paper eskf-mpc: Yang, Lyu, Chai 2022 in turbulent wind, with its baselines and ablations.
 
 Scenarios: S1 is the paper's spiral in Dryden turbulence with measurement noise A or B (and its noise and wind sweeps), S2 adds
-the mean wind, a real rotor's inflow, motor lag and a delayed command, S3 starts 3 m off and meets its constraints.
+the mean wind, a real rotor's inflow, motor lag and a delayed command, S3 starts 3 m off and meets its constraints; `--scenario speed` takes CPU times.
 """
 
 import argparse
@@ -59,6 +59,7 @@ PLAN: dict[str, list[str]] = {
     "S2-100ms-predicted": ["default", "default-first-order-prediction"],
     "S3": ["default", "closed", "default-integral", "closed-integral"],
 }
+SPEED = "speed"  # CPU times; flown by no default, since other work on the machine shows in it
 SETTLED = 1000  # steps before "ss" starts: 10 s
 Job = tuple[str, str, int]
 
@@ -69,13 +70,15 @@ class Flown(NamedTuple):
     counts: "Counts | None"  # of the quadratic programs, where there are any
 
 
-def fly(scenario_name: str, config_name: str, seed: int) -> Flown:
-    """One flight by the names of its rows."""
+def fly(scenario_name: str, config_name: str, seed: int, *, steps: int | None = None) -> Flown:
+    """One flight by the names of its rows; `steps`: only so many of its control periods."""
     from tools.papers.quad_in_wind import configs, constrained_flight, loop
 
     configs.pick(configs.SCENARIOS, scenario_name, "scenario")
     configs.pick(configs.CONFIGS, config_name, "config")
     scenario, config = configs.SCENARIOS[scenario_name], configs.CONFIGS[config_name]
+    if steps is not None:
+        scenario = scenario._replace(steps=steps)
     flight = configs.flight(config, scenario)
     noise, wind = configs.disturbances(scenario, seed)
     log = np.full((scenario.steps, loop.COLUMNS), np.nan)
@@ -124,6 +127,10 @@ def metrics(scenario: str, flown: Flown) -> dict[str, tuple[str, float]]:
 def job_rows(job: Job) -> list[Row]:
     """The rows of one flight."""
     scenario, config, seed = job
+    if scenario == SPEED:
+        from tools.papers.quad_in_wind import speed
+
+        return [common.row(SPEED, config, seed, name, unit, value) for name, (unit, value) in speed.measure(seed).items()]
     found = metrics(scenario, fly(scenario, config, seed))
     return [common.row(scenario, config, seed, name, unit, value) for name, (unit, value) in found.items()]
 
@@ -146,18 +153,21 @@ def summary(rows: list[Row]) -> list[Row]:
 
 
 def table(rows: list[Row]) -> str:
-    """One line per scenario and config: means over the seeds that were not lost."""
+    """One line per scenario and config: means over the seeds that were not lost. Other scenarios' figures below."""
     cells: dict[tuple[str, str], dict[str, float]] = {}
     for one in rows:
         if one["seed"] is None and one.get("stat") in ("mean", "sum"):
             cells.setdefault((one["scenario"], one["config"]), {})[one["metric"]] = one["value"]
-    lines = [
-        f"{'scenario':22}{'config':32}{'n':>8}{'e':>8}{'d':>8}{'ss 3-D':>9}{'full':>8}{'lost':>6}   (m, mean over the seeds)"
-    ]
+    heads = ("n", "e", "d", "ss 3-D", "full", "f rmse", "over", "lost")
+    names = ("rmse_n", "rmse_e", "rmse_d", "ss_3d", "full_3d", "f_rmse", "overshoot")
+    lines = [f"{'scenario':22}{'config':32}" + "".join(f"{h:>8}" for h in heads) + "   (m, m/s^2; means over the seeds)"]
     for (scenario, config), c in cells.items():
-        values = [c.get(name, math.nan) for name in ("rmse_n", "rmse_e", "rmse_d", "ss_3d", "full_3d")]
-        n, e, d, ss, full = (f"{v:.4f}" if math.isfinite(v) else "-" for v in values)
-        lines.append(f"{scenario:22}{config:32}{n:>8}{e:>8}{d:>8}{ss:>9}{full:>8}{c['lost']:>6.0f}")
+        if scenario == SPEED:
+            lines += [f"{scenario:22}{name:40}{value:12.4g}" for name, value in c.items()]
+            continue
+        values = [c.get(name, math.nan) for name in names]
+        shown = "".join(f"{v:>8.4f}" if math.isfinite(v) else f"{'-':>8}" for v in values)
+        lines.append(f"{scenario:22}{config:32}{shown}{c['lost']:>8.0f}")
     return "\n".join(lines)
 
 
@@ -175,10 +185,17 @@ def plan(scenarios: str, configs_text: str, seeds: list[int]) -> list[Job]:
     chosen = [s.strip() for s in scenarios.split(",") if s.strip()] or list(PLAN)
     named = [c.strip() for c in configs_text.split(",") if c.strip()]
     for name in chosen:
-        configs.pick(configs.SCENARIOS, name, "scenario")
+        configs.pick({**configs.SCENARIOS, SPEED: None}, name, "scenario")
     for name in named:
         configs.pick(configs.CONFIGS, name, "config")
-    return [(s, c, seed) for s in chosen for c in (named or PLAN[s]) for seed in seeds]
+    jobs = [(s, c, seed) for s in chosen if s != SPEED for c in (named or PLAN.get(s, ["default"])) for seed in seeds]
+    return jobs + [(SPEED, "default", seeds[0])] * (SPEED in chosen)
+
+
+def warm() -> None:
+    """Compile what the experiments need: one second of each kind of flight is the whole of it."""
+    for scenario, config in (("S1-A", "default"), ("S1-A", "ADRC"), ("S3", "default")):
+        fly(scenario, config, 1, steps=100)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -194,4 +211,9 @@ def run(args: argparse.Namespace) -> int:
         common.print_json("eskf-mpc", rows)
     else:
         sys.stdout.write(table(rows) + "\n")
+    if args.report:
+        from tools.papers import eskf_mpc_page
+
+        args.report.write_text(eskf_mpc_page.page_of(rows, common.parse_seeds(args.seeds)[0]), encoding="utf-8")
+        common.progress(f"report: {args.report}")
     return 0
