@@ -125,6 +125,10 @@ class Autopilot(ABC):
     def split_mode(self, custom_mode: int) -> tuple[int, int]:
         """HEARTBEAT's custom_mode as the two numbers of `set_mode`."""
 
+    def actuator_target(self, m: Any) -> None:
+        """SET_ACTUATOR_CONTROL_TARGET: left alone where nothing takes it."""
+        return
+
     def data_stream(self, stream: int) -> tuple[str, ...]:
         """The messages of an old REQUEST_DATA_STREAM; none where it is not honoured."""
         return ()

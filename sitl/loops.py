@@ -25,15 +25,15 @@ def run(s, sp, c):
     """One pass of all loops that are due: leaves s.outputs."""
     kind = sp.kind
     if kind in (OFF, IDLE):
-        _rest(s, 0.0 if kind == OFF else c.idle)
+        rest(s, 0.0 if kind == OFF else c.idle)
         return
     if kind in (POSITION, CLIMB):
         if s.step % c.position_every == 0:
             if c.personality == ARDUPILOT:
                 shaping.aim(s, sp, c)
             else:
-                _aim(s, sp)
-            _position(s, sp, c)
+                aim(s, sp)
+            position(s, sp, c)
     else:
         s.thrust = sp.thrust
     if kind in (ATTITUDE, CLIMB):
@@ -47,7 +47,7 @@ def run(s, sp, c):
 
 
 @kernel
-def _rest(s, output):
+def rest(s, output):
     """Rotors stopped or idling, everything that remembers at its beginning."""
     for i in range(4):
         s.outputs[i] = output
@@ -69,14 +69,14 @@ def _rest(s, output):
 
 
 @kernel
-def _aim(s, sp):
+def aim(s, sp):
     """PX4: the position loop is after the setpoint itself."""
     for i in range(3):
         s.aim_p[i], s.aim_v[i], s.aim_a[i] = sp.p_ned_m[i], sp.v_ned_m_s[i], sp.a_ned_m_s2[i]
 
 
 @kernel
-def _position(s, sp, c):
+def position(s, sp, c):
     """Wanted attitude and thrust from the aim; an axis without position or velocity is led by the rest. CLIMB takes the thrust."""
     vn, ve, vd = _velocity(s, c, 0), _velocity(s, c, 1), _velocity(s, c, 2)
     k = min(1.0, c.speed_max[0] / max(1e-9, math.hypot(vn, ve)))

@@ -88,7 +88,7 @@ def step(s, c):
     if s.grounded and k2[2] >= 0.0:  # weight still on the legs: they turn the body level and hold it
         k2 = (-v[0] / dt, -v[1] / dt, -v[2] / dt)
         v_mid = (0.0, 0.0, 0.0)
-        w_mid = _levelling(R)
+        w_mid = levelling(R)
         w = w_mid
         j2 = (0.0, 0.0, 0.0)
     else:
@@ -128,7 +128,7 @@ def _lagged(T, outputs, full, keep):
 
 
 @kernel
-def _levelling(R):
+def levelling(R):
     """Body rates that turn the body level about a horizontal axis, its heading kept."""
     # world e3 in body axes is the third row; level is (0, 0, 1): turn along their cross product
     return (-_LEGS_1_S * R[7], _LEGS_1_S * R[6], 0.0)

@@ -10,7 +10,8 @@ from mavquad.airframe import Airframe
 from sitl import autopilot
 from sitl.autopilot import ACCEPTED, CRITICAL, DENIED, NOTICE, TEMPORARILY_REJECTED, WARNING, Autopilot
 from sitl.config import ORIGIN
-from sitl.state import ATTITUDE, POSITION, RATES
+from sitl.helicopter import Helicopter
+from sitl.state import ATTITUDE, POSITION, RATES, STICKS
 
 MANUAL, ALTCTL, POSCTL, AUTO, ACRO, OFFBOARD, STABILIZED = 1, 2, 3, 4, 5, 6, 7
 TAKEOFF, LOITER, MISSION, RTL, LAND = 2, 3, 4, 5, 6  # sub-modes of AUTO
@@ -23,6 +24,7 @@ STREAMS_HZ = {
     "HIGHRES_IMU": 250.0,
     "LOCAL_POSITION_NED": 50.0,
     "SERVO_OUTPUT_RAW": 250.0,
+    "ACTUATOR_CONTROL_TARGET": 50.0,
     "ATTITUDE_TARGET": 50.0,
     "SYS_STATUS": 1.0,
     "EXTENDED_SYS_STATE": 2.0,
@@ -40,38 +42,51 @@ STREAMS_HZ = {
 
 
 def defaults(tuned: Airframe) -> dict[str, int | float]:
-    """PX4's parameters as far as this autopilot has them."""
-    return {
-        "COM_ARM_WO_GPS": 1,
-        "COM_DISARM_LAND": 2.0,
-        "COM_OBL_ACT": 1,  # what follows lost setpoints: 0 land, 1 hold, 2 return
-        "COM_OF_LOSS_T": 1.0,
-        "MAV_COMP_ID": 1,
-        "MAV_SYS_ID": 1,
-        "MAV_TYPE": 2,
-        "MC_PITCHRATE_MAX": 220.0,
-        "MC_PITCH_P": 9.0,
-        "MC_ROLLRATE_MAX": 220.0,
-        "MC_ROLL_P": 9.0,
-        "MC_YAWRATE_MAX": 200.0,
-        "MC_YAW_P": 2.8,
-        "MIS_TAKEOFF_ALT": 2.5,
-        "MPC_LAND_ALT1": 10.0,
-        "MPC_LAND_SPEED": 0.7,
-        "MPC_THR_HOVER": tuned.hover_thrust,
-        "MPC_TILTMAX_AIR": 45.0,
-        "MPC_TKO_SPEED": 1.5,
-        "MPC_XY_P": 0.95,
-        "MPC_XY_VEL_I_ACC": 0.4,
-        "MPC_XY_VEL_MAX": 12.0,
-        "MPC_XY_VEL_P_ACC": 1.8,
-        "MPC_Z_P": 1.0,
-        "MPC_Z_VEL_I_ACC": 2.0,
-        "MPC_Z_VEL_MAX_DN": 1.5,
-        "MPC_Z_VEL_MAX_UP": 3.0,
-        "MPC_Z_VEL_P_ACC": 4.0,
-        "SYS_AUTOSTART": 4001,
-    }
+    """PX4's parameters as far as this autopilot has them; a helicopter's rotor is slower than four motors, and so are its loops."""
+    return {**_ALL, "MPC_THR_HOVER": tuned.hover_thrust, **(_HELICOPTER if tuned.kind == "helicopter" else {})}
+
+
+_HELICOPTER = {
+    "MAV_TYPE": 4,
+    "MPC_TILTMAX_AIR": 22.0,
+    "MPC_XY_P": 0.5,
+    "MPC_XY_VEL_I_ACC": 0.2,
+    "MPC_XY_VEL_P_ACC": 0.9,
+    "MPC_Z_P": 0.8,
+    "MPC_Z_VEL_I_ACC": 0.5,
+    "MPC_Z_VEL_P_ACC": 2.0,
+}
+_ALL: dict[str, int | float] = {
+    "COM_ARM_WO_GPS": 1,
+    "COM_DISARM_LAND": 2.0,
+    "COM_OBL_ACT": 1,  # what follows lost setpoints: 0 land, 1 hold, 2 return
+    "COM_OF_LOSS_T": 1.0,
+    "MAV_COMP_ID": 1,
+    "MAV_SYS_ID": 1,
+    "MAV_TYPE": 2,
+    "MC_PITCHRATE_MAX": 220.0,
+    "MC_PITCH_P": 9.0,
+    "MC_ROLLRATE_MAX": 220.0,
+    "MC_ROLL_P": 9.0,
+    "MC_YAWRATE_MAX": 200.0,
+    "MC_YAW_P": 2.8,
+    "MIS_TAKEOFF_ALT": 2.5,
+    "MPC_LAND_ALT1": 10.0,
+    "MPC_LAND_SPEED": 0.7,
+    "MPC_THR_HOVER": 0.5,
+    "MPC_TILTMAX_AIR": 45.0,
+    "MPC_TKO_SPEED": 1.5,
+    "MPC_XY_P": 0.95,
+    "MPC_XY_VEL_I_ACC": 0.4,
+    "MPC_XY_VEL_MAX": 12.0,
+    "MPC_XY_VEL_P_ACC": 1.8,
+    "MPC_Z_P": 1.0,
+    "MPC_Z_VEL_I_ACC": 2.0,
+    "MPC_Z_VEL_MAX_DN": 1.5,
+    "MPC_Z_VEL_MAX_UP": 3.0,
+    "MPC_Z_VEL_P_ACC": 4.0,
+    "SYS_AUTOSTART": 4001,
+}
 
 
 class Px4(Autopilot):
@@ -102,7 +117,7 @@ class Px4(Autopilot):
     def heartbeat(self) -> tuple[int, ...]:
         main, sub = self.mode
         base = 1 | (128 if self.armed else 0) | (16 | 8 | 4 if main in (AUTO, OFFBOARD) else 64)
-        return 2, self.kind, base, main << 16 | sub << 24, 4 if self.armed else 3, 3
+        return self.vehicle.mav_type, self.kind, base, main << 16 | sub << 24, 4 if self.armed else 3, 3
 
     def can_arm(self) -> str:
         if self.t_us - self.boot_us < _BOOT_US:
@@ -256,6 +271,16 @@ class Px4(Autopilot):
             }
         )
 
+    def actuator_target(self, m: Any) -> None:
+        """A helicopter's sticks (roll, pitch, yaw, throttle): group 0 in place of the inner loop, group 3 (passthrough) on top of it."""
+        sticks = tuple(float(x) for x in m.controls[:4])
+        if not isinstance(self.vehicle, Helicopter) or not autopilot.finite(sticks) or max(map(abs, sticks)) > 1.0:
+            return
+        if m.group_mlx == 0:
+            self._accept({"kind": STICKS, "sticks": sticks, "q": None})
+        elif m.group_mlx == 3 and self.engaged:
+            self.vehicle.add_sticks(*sticks)
+
     def _accept(self, wanted: dict[str, Any]) -> None:
         now = self.vehicle.t_us
         if self.setpoint_us < 0 or now - self.setpoint_us > _OFFBOARD_GAP_US:
@@ -279,6 +304,10 @@ class Px4(Autopilot):
             self._yaw_rate = wanted["yaw_rate"] if math.isnan(wanted["yaw"]) else 0.0
             for name in ("p_ned_m", "v_ned_m_s", "a_ned_m_s2"):
                 sp[name] = wanted[name]
+            self.echo_q = None
+        elif wanted["kind"] == STICKS:
+            assert isinstance(self.vehicle, Helicopter)
+            self.vehicle.give_sticks(*wanted["sticks"])
             self.echo_q = None
         else:
             sp["thrust"], sp["rates_rad_s"] = wanted["thrust"], wanted["rates_rad_s"]

@@ -29,6 +29,7 @@ class Services:
         by_name: dict[str, Callable[[Link, Frame, Any], None]] = {
             "SET_ATTITUDE_TARGET": lambda link, frame, m: sim.autopilot.attitude_target(m),
             "SET_POSITION_TARGET_LOCAL_NED": lambda link, frame, m: sim.autopilot.position_target(m),
+            "SET_ACTUATOR_CONTROL_TARGET": lambda link, frame, m: sim.autopilot.actuator_target(m),
             "COMMAND_LONG": self._command_long,
             "COMMAND_INT": self._command_int,
             "SET_MODE": self._set_mode,

@@ -13,6 +13,7 @@ from mavquad.wire import Frame
 from sitl import ardupilot, config, links, px4, telemetry
 from sitl.autopilot import TICK_US, Autopilot, check_airframe
 from sitl.faults import Faults
+from sitl.helicopter import Helicopter
 from sitl.links import NEVER, Link, Stream
 from sitl.params import Table
 from sitl.services import Services
@@ -35,7 +36,7 @@ class Simulation:
     def __init__(self, sitl: config.Sitl, record: Record | None = None, lockstep: bool = False) -> None:
         self.config, self.lockstep = sitl, lockstep
         self.epoch_us = config.EPOCH_US
-        self.vehicle = Vehicle(sitl)
+        self.vehicle = Helicopter(sitl) if config.vehicles(sitl)[1].kind == "helicopter" else Vehicle(sitl)
         check_airframe(self.vehicle)
         self.links: list[Link] = []
         self.partner: Link | None = None  # of the lockstep
@@ -202,7 +203,8 @@ class Simulation:
 
     def _offered(self) -> set[str]:
         other = {"px4": "EKF_STATUS_REPORT", "ardupilot": "ESTIMATOR_STATUS"}[self.config.personality]
-        return set(telemetry.ORDER) - {other}
+        without = set() if isinstance(self.vehicle, Helicopter) else {"ACTUATOR_CONTROL_TARGET"}
+        return set(telemetry.ORDER) - {other} - without
 
     def _default_hz(self, name: str) -> float:
         source = self.config.attitude_source

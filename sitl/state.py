@@ -12,6 +12,7 @@ from mavquad.jit import COMPILED
 
 OFF, IDLE, RATES, ATTITUDE, POSITION = 0, 1, 2, 3, 4  # what the inner loops are asked to do (SETPOINT.kind)
 CLIMB = 5  # ATTITUDE, with a climb rate (in v_ned_m_s) in place of thrust
+STICKS = 6  # a helicopter's sticks from outside
 PX4, ARDUPILOT = 0, 1  # CONSTANTS.personality
 
 VEHICLE = np.dtype(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from sitl.autopilot import geodetic
 from sitl.config import ORIGIN
+from sitl.helicopter import Helicopter
 from sitl.plant import GRAVITY_M_S2
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ ORDER = (
     "ATT_POS_MOCAP",
     "LOCAL_POSITION_NED",
     "SERVO_OUTPUT_RAW",
+    "ACTUATOR_CONTROL_TARGET",
     "ATTITUDE_TARGET",
     "POSITION_TARGET_LOCAL_NED",
     "SYS_STATUS",
@@ -82,6 +84,11 @@ def builders(sim: "Simulation") -> dict[str, Callable[[], Fields | None]]:
 
     def servo_output_raw() -> Fields:
         return boot_us() & 0xFFFFFFFF, 0, *v.state.view["pwm_us"].tolist(), *_ZEROS_12
+
+    def actuator_control_target() -> Fields | None:
+        if not isinstance(v, Helicopter):
+            return None
+        return boot_us(), 0, (*v.sticks(), 0.0, 0.0, 0.0, 0.0)
 
     def local_position_ned() -> Fields | None:
         if not sim.autopilot.has_origin:
@@ -161,6 +168,7 @@ def builders(sim: "Simulation") -> dict[str, Callable[[], Fields | None]]:
         ),
         "LOCAL_POSITION_NED": local_position_ned,
         "SERVO_OUTPUT_RAW": servo_output_raw,
+        "ACTUATOR_CONTROL_TARGET": actuator_control_target,
         "ATTITUDE_TARGET": attitude_target,
         "POSITION_TARGET_LOCAL_NED": position_target,
         "SYS_STATUS": sys_status,

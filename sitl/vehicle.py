@@ -33,7 +33,7 @@ class _Tuning(NamedTuple):
     position_delay_ms: tuple[int, int]  # constant within a run, drawn between these
 
 
-_TUNING = {
+TUNING = {
     "px4": _Tuning(PX4, 60.0, 28.0, 15.0, 0.3, (0.0, 0.0, 0.0), (0, 0)),
     "ardupilot": _Tuning(ARDUPILOT, 20.0, 22.0, 5.0, 0.5, (0.015, -0.012, 0.006), (8, 50)),
 }
@@ -47,13 +47,13 @@ def advance(vehicle, setpoint, constants, gusts, normals, steps):
         n = normals[s.step % normals.shape[0]]
         loops.run(s, sp, c)
         if s.step % c.air_every == 0:
-            _air(s, c, gusts, n)
+            air(s, c, gusts, n)
         plant.step(s, c)
         sensors.sense(s, c, n)
 
 
 @kernel
-def _air(s, c, gusts, n):
+def air(s, c, gusts, n):
     """The wind at the vehicle, held until the next sample: mean at this height, turbulence along it, gusts."""
     k = 1.0
     if c.profile:
@@ -74,6 +74,8 @@ def _air(s, c, gusts, n):
 
 class Vehicle:
     """State, setpoint and constants of one vehicle, and the noise it is given. Deterministic in its configuration."""
+
+    mav_type = 2
 
     def __init__(self, sitl: config.Sitl) -> None:
         tuned, true = config.vehicles(sitl)
@@ -99,12 +101,16 @@ class Vehicle:
         """Move on by a number of loop periods."""
         while steps > 0:
             now = min(steps, self._left)
-            advance(self.state.array, self.setpoint.array, self.constants.array, self._gusts, self._normals, now)
+            self.actuate(now)
             self.t_us += now * self.dt_us
             self._left -= now
             steps -= now
             if not self._left:
                 self._draw()
+
+    def actuate(self, steps: int) -> None:
+        """That many steps, which the normals drawn last for."""
+        advance(self.state.array, self.setpoint.array, self.constants.array, self._gusts, self._normals, steps)
 
     def _draw(self) -> None:
         self._left = _BLOCK
@@ -124,7 +130,6 @@ class Vehicle:
 
     def _fill_air(self, sitl: config.Sitl, true: Airframe) -> None:
         c, w = self.constants, sitl.wind
-        assert true.rotors is not None
         towards = math.radians(w.from_deg + 180.0)
         c["wind_to"] = math.cos(towards), math.sin(towards)
         c["mean_wind_m_s"] = w.mean_m_s * math.cos(towards), w.mean_m_s * math.sin(towards)
@@ -134,14 +139,19 @@ class Vehicle:
         c["air_density"], c["rotor_disk_m2"] = w.air_density_kg_m3, w.rotor_disk_m2
         if w.w20_m_s > 0.0:
             airspeed = w.turbulence_airspeed_m_s or wind.mean_at(w.w20_m_s, w.turbulence_height_m)
-            d = wind.dryden(w.w20_m_s, w.turbulence_height_m, 2.0 * true.rotors.arm_m, airspeed)
+            d = wind.dryden(w.w20_m_s, w.turbulence_height_m, self._span_m(true), airspeed)
             c["F"], c["B"], c["C"] = d.F, d.B, d.C
             self.state["turbulence"] = d.P0 @ np.random.default_rng([sitl.seed, 0]).standard_normal(7)
+
+    def _span_m(self, true: Airframe) -> float:
+        """What turbulence sees of the vehicle."""
+        assert true.rotors is not None
+        return 2.0 * true.rotors.arm_m
 
     def _fill_sensors(self, sitl: config.Sitl) -> None:
         c, n, dt = self.constants, sitl.noise, 1.0 / sitl.rate_hz
         c["gyro_sigma"], c["accel_sigma"] = n.gyro_rad_s, n.accel_m_s2
-        tuning = _TUNING[sitl.personality]
+        tuning = TUNING[sitl.personality]
         c["gyro_bias"], c["accel_bias"] = n.gyro_bias_rad_s, n.accel_bias_m_s2
         c["velocity_bias"] = tuning.velocity_bias_m_s if n.velocity_bias_m_s is None else n.velocity_bias_m_s
         keep = math.exp(-dt / sensors.DRIFT_S)
@@ -161,7 +171,7 @@ class Vehicle:
     def _fill_tuning(self, sitl: config.Sitl, tuned: Airframe) -> None:
         c = self.constants
         assert tuned.rotors is not None
-        tuning = _TUNING[sitl.personality]
+        tuning = TUNING[sitl.personality]
         c["personality"] = tuning.number
         c["tuned_inertia"], c["tuned_thrust_max_n"] = tuned.body.inertia_kg_m2, tuned.rotors.thrust_max_n
         c["idle"] = tuned.rotors.thrust_min_n / tuned.rotors.thrust_max_n
