@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from mavquad.errors import LogError
 from mavquad.link.columns import Log
-from mavquad.link.recording import Recording, Signal, first_bytes, from_tlog, not_enough_for, open_recording
+from mavquad.link.recording import Recording, Signal, from_tlog, kept_aboard, not_enough_for, open_recording
 
 Array = NDArray[Any]
 Tables = dict[str, Array]
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
 
 def load(args: argparse.Namespace) -> tuple[Tables, list[str]]:
     """The tables asked for, and what is to be said of the log."""
-    if first_bytes(args.log)[:4] != b"ULog" and first_bytes(args.log)[:2] != b"\xa3\x95":
+    if not kept_aboard(args.log):
         log = Log(args.log, args.dialect)
         if not args.signals:
             return messages(log, args.system, args.component), [log.problem] if log.problem else []

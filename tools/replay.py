@@ -22,7 +22,7 @@ from mavquad.errors import ConfigError, FlightError, LogError
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of a replay."""
-    parser.add_argument("log", type=Path, help="a .tlog file")
+    parser.add_argument("log", type=Path, help="a .tlog file; or a PX4 .ulg, an ArduPilot .bin")
     parser.add_argument("--verify", action="store_true", help="compare with what was sent then; exit 1 where the two part")
     parser.add_argument("--plan", type=Path, help="the flight's plan.toml (default: beside the log, where there is one)")
     parser.add_argument("--config", type=Path, help="a companion.toml to run instead of the flight's own")
@@ -41,12 +41,21 @@ def run(args: argparse.Namespace) -> int:
     """Replay one log. 0 done, 1 where --verify fails."""
     if args.verify:
         return _verify(args)
+    from mavquad.link import recording
     from mavquad.link.columns import Log
-    from tools import survey
+    from tools import survey, survey_aboard
 
     begun = time.perf_counter()
-    log = Log(args.log)
-    result = survey.survey(log, args.observer or ["gsmo"], args.from_s, args.to_s)
+    observers = args.observer or ["gsmo"]
+    log: Any
+    if recording.kept_aboard(args.log):
+        if args.csv:
+            raise ConfigError(f"{args.log}: --csv runs the pipeline over MAVLink frames; a log kept aboard holds none")
+        log = recording.open_recording(args.log)
+        result = survey_aboard.survey(log, observers, args.from_s, args.to_s)
+    else:
+        log = Log(args.log)
+        result = survey.survey(log, observers, args.from_s, args.to_s)
     if args.csv:
         result["trace"] = _write_trace(args, log)
     result["wall_s"] = time.perf_counter() - begun

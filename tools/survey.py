@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from mavquad import airframe
 from mavquad.errors import LogError
 from mavquad.link.columns import Log, Stream
+from mavquad.link.recording import not_enough_for
 from mavquad.plan import OBSERVERS, stage
 from tools import rates
 
 _IN_AIR = 2  # MAV_LANDED_STATE
-_SLOW_HZ = 40.0  # below this, rates of a multirotor cannot be had from attitude
+SLOW_HZ = 40.0  # below this, rates of a multirotor cannot be had from attitude
 
 
 def survey(log: Log, observers: list[str], from_s: float | None, to_s: float | None) -> dict[str, Any]:
@@ -26,6 +27,7 @@ def survey(log: Log, observers: list[str], from_s: float | None, to_s: float | N
         "junk_bytes": log.junk_bytes,
         "problem": log.problem or None,
         "streams": streams(log),
+        "notes": not_enough_for(log),
     }
     try:
         result["rates"] = body_rates(log, observers, from_s, to_s)
@@ -65,28 +67,12 @@ def body_rates(log: Log, observers: list[str], from_s: float | None, to_s: float
     use = _inside(log, source, rows, a.t_us, span)
     if use.sum() < 100:
         raise LogError(f"{int(use.sum())} attitude samples between {span[0]:.1f} and {span[1]:.1f} s, at least 100 are needed")
-    plain = rates.difference(a)
-    ways: list[dict[str, Any]] = []
-
-    def way(name: str, torque: str, rate: rates.Array, **more: Any) -> None:
-        ways.append({"method": name, "torque": torque, "rms_rad_s": rates.rms(rate - reference, use), **more})
-
     torque, torque_text = _torque(log, source, a, use)
-    for label in observers:
-        w, counts = _observe(label, a, None)
-        way(label, "unknown", w, rejected=counts)
-        if torque is not None:
-            way(label, "from SERVO_OUTPUT_RAW", _observe(label, a, torque)[0])
-    way("difference", "-", plain)
-    way("difference, extrapolated half a sample", "-", rates.extrapolated(plain))
-    for cut_hz in (5.0, 20.0):
-        way(f"difference, {cut_hz:g} Hz Butterworth", "-", rates.butterworth(a, plain, cut_hz))
     reported = np.column_stack([rows[f"{k}speed"] for k in ("roll", "pitch", "yaw")]).astype(float)
     keep = np.searchsorted(a.t_us, 1000 * rows["time_boot_ms"].astype(np.int64))
     told = np.full_like(reference, np.nan)
     told[np.minimum(keep, len(told) - 1)] = reported
-    way("rates the autopilot reports", "-", told)
-    note = f"{hz:.0f} Hz is too slow for the rates of a multirotor: read them as trends" if hz < _SLOW_HZ else None
+    ways = compare(a, reference, use, observers, torque, told)
     return {
         "source": f"{source.system}/{source.component} {source.name}",
         "sample_hz": hz,
@@ -99,8 +85,38 @@ def body_rates(log: Log, observers: list[str], from_s: float | None, to_s: float
         "signal_rms_rad_s": rates.rms(reference, use),
         "ways": ways,
         "torque_model": torque_text,
-        "note": note,
+        "note": slow_note(hz),
     }
+
+
+def compare(
+    a: rates.Attitudes,
+    reference: rates.Array,
+    use: NDArray[np.bool_],
+    observers: list[str],
+    torque: rates.Array | None,
+    told: rates.Array,
+    outputs: str = "SERVO_OUTPUT_RAW",
+) -> list[dict[str, Any]]:
+    """Each way to the body rates and its rms error per axis over the samples `use`; `told` (n, 3) are the autopilot's own."""
+    plain = rates.difference(a)
+    ways: list[dict[str, Any]] = []
+
+    def way(name: str, torque: str, rate: rates.Array, **more: Any) -> None:
+        ways.append({"method": name, "torque": torque, "rms_rad_s": rates.rms(rate - reference, use), **more})
+
+    for label in observers:
+        w, counts = _observe(label, a, None)
+        way(label, "unknown", w, rejected=counts)
+        if torque is not None:
+            way(label, f"from {outputs}", _observe(label, a, torque)[0])
+    way("difference", "-", plain)
+    way("difference, extrapolated half a sample", "-", rates.extrapolated(plain))
+    for cut_hz in (5.0, 20.0):
+        way(f"difference, {cut_hz:g} Hz Butterworth", "-", rates.butterworth(a, plain, cut_hz))
+    if np.isfinite(told[use]).any():
+        way("rates the autopilot reports", "-", told)
+    return ways
 
 
 def _attitude_stream(log: Log) -> Stream:
@@ -151,6 +167,13 @@ def _torque(log: Log, source: Stream, a: rates.Attitudes, use: NDArray[np.bool_]
     wrapped = rows["time_usec"].astype(np.int64)
     t_us = wrapped + np.concatenate([[0], np.cumsum(np.where(np.diff(wrapped) < -(1 << 31), 1 << 32, 0))])
     u = (np.column_stack([rows[f"servo{i}_raw"] for i in (1, 2, 3, 4)]).astype(float) - 1000.0) / 1000.0
+    return fitted(a, t_us, u, use)
+
+
+def fitted(
+    a: rates.Attitudes, t_us: NDArray[np.int64], u: rates.Array, use: NDArray[np.bool_]
+) -> tuple[rates.Array | None, dict[str, Any]]:
+    """Torque over inertia at every attitude sample by outputs u (m, 4) 0..1, None where they do not tell it; the model in words."""
     try:
         model, torque = rates.fit_torque(a, t_us, u, use)
     except LogError as error:
@@ -162,6 +185,11 @@ def _torque(log: Log, source: Stream, a: rates.Attitudes, use: NDArray[np.bool_]
         "lag_s": model.lag_s,
         "explained": model.explained.tolist(),
     }
+
+
+def slow_note(hz: float) -> str | None:
+    """What is to be said of rates from attitude at so many samples a second."""
+    return f"{hz:.0f} Hz is too slow for the rates of a multirotor: read them as trends" if hz < SLOW_HZ else None
 
 
 def finite(value: Any) -> Any:
@@ -178,7 +206,10 @@ def show(result: dict[str, Any]) -> None:
     print(f"{result['log']}: {result['messages']} messages in {result['span_s']:.1f} s, {result['junk_bytes']} bytes of junk")
     for s in result["streams"]:
         rate = "" if s["rate_hz"] is None else f"{s['rate_hz']:8.2f} Hz"
-        print(f"  {s['system']:3}/{s['component']:<3} {s['name']:28} {s['count']:8} {rate}")
+        who = "" if s["system"] is None else f"{s['system']:3}/{s['component']:<3} "
+        print(f"  {who}{s['name']:28} {s['count']:8} {rate}")
+    for note in result["notes"]:
+        print(f"  {note}")
     r = result["rates"]
     if "ways" not in r:
         print(f"no body rates: {r['problem']}")

@@ -7,7 +7,7 @@ them. What a recording is too slow for is said, by rate.
 import heapq
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mavquad import wire
 from mavquad.errors import LinkError, LogError
 from mavquad.link import signals
-from mavquad.link.columns import Log
+from mavquad.link.columns import Log, Stream
 from mavquad.signals import Attitude, Imu, Mocap, Motors, Position, Target
 
 Array = NDArray[Any]
@@ -74,7 +74,7 @@ def open_recording(path: Path | str, *, system: int | None = None, component: in
     Raises LogError for a file that is missing, empty or of no known kind.
     """
     path = Path(path)
-    head = first_bytes(path)
+    head = _first_bytes(path)
     if head.startswith(b"ULog"):
         from mavquad.link import ulog  # pyulog: only where such a log is read
 
@@ -86,7 +86,12 @@ def open_recording(path: Path | str, *, system: int | None = None, component: in
     return from_tlog(Log(path), system=system, component=component)
 
 
-def first_bytes(path: Path) -> bytes:
+def kept_aboard(path: Path) -> bool:
+    """Whether a file is an autopilot's own log (ULog, DataFlash) by its first bytes. Raises LogError where there is none."""
+    return _first_bytes(path).startswith((b"ULog", b"\xa3\x95"))
+
+
+def _first_bytes(path: Path) -> bytes:
     """Up to eight bytes. Raises LogError where there is no such file."""
     try:
         with path.open("rb") as stream:
@@ -106,10 +111,9 @@ def from_tlog(log: Log, *, system: int | None = None, component: int | None = No
     for name, decode in signals.DECODERS.items():
         for stream in log.find(name, *sender):
             got: list[tuple[int, Any]] = []
-            for number in log.numbers(stream):
-                arrival_us, frame = log.frame(int(number))
+            for arrival_us, message in _messages(log, stream):
                 try:
-                    got.append((arrival_us, decode(wire.decode(frame))))
+                    got.append((arrival_us, decode(message)))
                 except LinkError:
                     refused += 1
             if got and (type(got[0][1]) not in found or len(got) > 1.2 * len(found[type(got[0][1])].arrival_us)):
@@ -117,6 +121,14 @@ def from_tlog(log: Log, *, system: int | None = None, component: int | None = No
     if Motors in found and Attitude in found:
         found[Motors] = _unwrapped(found[Motors], found[Attitude])
     return Recording(log.path, "tlog", found, tables, refused, log.problem)
+
+
+def _messages(log: Log, stream: Stream) -> Iterator[tuple[int, Any]]:
+    """(arrival_us, message) of a stream, the messages as `wire.decode` gives them."""
+    rows, make = log.rows(stream), wire.spec(stream.name).make
+    fields = [rows[name] for name in (rows.dtype.names or ())[1:-1]]  # between t_us and frame_seq: in declared order
+    columns = [map(tuple, field.tolist()) if field.ndim == 2 else field.tolist() for field in fields]
+    return zip(rows["t_us"].tolist(), map(make, *columns), strict=True)
 
 
 def _sender(log: Log, system: int | None, component: int | None) -> tuple[int, int]:
@@ -152,13 +164,27 @@ def _samples(signal: Signal) -> Iterator[tuple[int, Any]]:
     return zip(signal.arrival_us.tolist(), map(signal.kind._make, zip(*fields, strict=True)), strict=True)
 
 
-def not_enough_for(recording: Recording) -> list[str]:
+def rates_hz(source: Recording | Log) -> dict[Kind, float]:
+    """The median rate of each kind of sample; of a tlog the best of its messages, without decoding them."""
+    if isinstance(source, Recording):
+        return {kind: signal.rate_hz() for kind, signal in source.signals.items()}
+    best: dict[Kind, float] = {}
+    for name, decode in signals.DECODERS.items():
+        kind = get_type_hints(decode)["return"]
+        for stream in source.find(name):
+            gaps = np.diff(source.t_us[source.numbers(stream)])
+            gaps = gaps[gaps > 0]
+            best[kind] = max(best.get(kind, 0.0), 1e6 / float(np.median(gaps)) if gaps.size else 0.0)
+    return best
+
+
+def not_enough_for(source: Recording | Log) -> list[str]:
     """One line for each method that this recording cannot feed: what it has, what it takes, and why."""
-    lines = []
+    have_hz, lines = rates_hz(source), []
     for need in NEEDS:
         lacks = []
         for kind, needed in need.rates_hz:
-            have = recording.signals[kind].rate_hz() if kind in recording.signals else 0.0
+            have = have_hz.get(kind, 0.0)
             if have < 0.9 * needed:
                 state = f"at {have:.1f} Hz is too slow" if have else "is missing"
                 lacks.append(f"{kind.__name__.lower()} {state}, needs {needed:g} Hz")
