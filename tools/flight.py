@@ -73,7 +73,7 @@ def fly(run: Path, pace: Pace, max_time_s: float, watch: Watcher) -> Flown:
     said = _Tail(run / "companion.txt")
     problems: list[str] = []
     try:
-        while sitl.poll() is None and companion.poll() is None:
+        while sitl.poll() is None and companion.poll() is None and not _given_up(said.all):
             time.sleep(_POLL_S)
             watch(vehicle_time_s(run / "flight.trace"), said.new())
         if companion.poll() is not None:
@@ -88,6 +88,11 @@ def fly(run: Path, pace: Pace, max_time_s: float, watch: Watcher) -> Flown:
     elif companion.returncode and not problems:
         problems.append(f"the companion ended with {companion.returncode}: {_last_words(run / 'companion.txt')}")
     return Flown(_last_json(run / "sitl.json"), _last_json(run / "companion.json"), wall_s, said.all, problems)
+
+
+def _given_up(said: list[str]) -> bool:
+    """Whether the companion has released the vehicle without ever flying it: nothing more will come."""
+    return any(" released: " in line for line in said) and not any(" engaged: " in line for line in said)
 
 
 def vehicle_time_s(trace: Path) -> float:

@@ -28,6 +28,10 @@ VEHICLE = {  # short names of what a vehicle can differ in from its file
     "motor_lag": "rotors.lag_s",
 }
 MOCAP_OBSERVERS = ("gsmo:source=mocap", "gsmo:source=mocap,torque=motors")  # rates without a gyro, torque unknown and known
+PARAMS: dict[str, dict[str, float]] = {
+    "px4": {},
+    "ardupilot": {"GUID_OPTIONS": 8},
+}  # as the companion asks for it: thrust as thrust
 COMPANION_TABLES = ("limits", "safety")
 
 
@@ -128,7 +132,7 @@ def resolve(scenario: Scenario, options: Options) -> Resolved:
         noise=scenario.noise,
         link=scenario.link,
         faults=scenario.faults,
-        params=scenario.params,
+        params={**PARAMS[options.personality], **scenario.params},
     )
     if options.observers is None and options.attitude != "ahrs":
         options = msgspec.structs.replace(options, observers=[*MOCAP_OBSERVERS])

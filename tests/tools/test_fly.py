@@ -144,6 +144,12 @@ def test_a_program_that_ends_in_flight_is_named_with_its_last_words(tmp_path, mo
     assert "seed = -1" in flown.problems[0]
 
 
+def test_a_companion_that_refuses_to_fly_ends_the_flight_with_its_reason(tmp_path, capsys):
+    words = [*SHORT, "--personality", "ardupilot", "--set", "params.GUID_OPTIONS=0", "--run", str(tmp_path / "run")]
+    assert tools_main.main(["fly", *words]) == 1
+    assert "never engaged (last: released set GUID_OPTIONS to 8)" in capsys.readouterr().err
+
+
 def test_an_unwritable_place_is_said(tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("")
