@@ -58,7 +58,7 @@ def steps() -> Iterator[Step]:
     from mavquad.plan import COMPENSATORS, CONTROLLERS, OBSERVERS
 
     yield "reading logs", _logs
-    yield "the simulated vehicle", _sitl
+    yield "the simulated vehicle", vehicle
     for name in OBSERVERS:
         yield f"observer {name}", lambda name=name: _stages(observers=[name])  # type: ignore[misc]
     for name in CONTROLLERS:
@@ -83,11 +83,11 @@ def flight(resolved: "Resolved") -> None:
     from mavquad import plan, warm
 
     warm.run(plan.build(resolved.companion))
-    _sitl()
+    vehicle()
     _logs()
 
 
-def _sitl() -> None:
+def vehicle() -> None:
     """A second of the simulated vehicle, alone."""
     from sitl.config import Sitl
     from sitl.simulation import Simulation

@@ -12,7 +12,7 @@ import pytest
 from mavquad import lifecycle
 from mavquad.settings import Companion
 from tools import __main__ as tools_main
-from tools import check
+from tools import check, warm
 
 ROOT = Path(__file__).resolve().parents[2]
 SUMMARY = {
@@ -76,6 +76,7 @@ def test_people_see_rates_methods_and_what_is_in_the_way(capsys):
 
 
 def test_a_simulated_autopilot_is_checked_over_udp(capsys):
+    warm.vehicle()
     port = _free_port()
     command = [sys.executable, "-m", "sitl", "--endpoint", f"udpin:127.0.0.1:{port}", "--max-time", "60"]
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as sitl:
