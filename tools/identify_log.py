@@ -62,8 +62,7 @@ class Flight(NamedTuple):
 
 def read(path: Path) -> Flight:
     """Any recording. Raises LogError where it is none, or holds no attitude."""
-    head = recording.first_bytes(path)
-    if head.startswith((b"ULog", b"\xa3\x95")):
+    if recording.kept_aboard(path):
         return _from_signals(recording.open_recording(path))
     return _from_tlog(Log(path))
 
