@@ -33,7 +33,7 @@ SETTLE_TICKS = 400  # in which the half-width of a quiet vehicle is reached
 WOUND_UP_M_S2 = 1.0  # how far beyond the bounds a controller's own estimate is believed
 
 PUBLISHED = (
-    "f_n", "f_e", "f_d", "low_n", "low_e", "low_d", "high_n", "high_e", "high_d", "f_roll", "f_pitch",
+    "f_n", "f_e", "f_d", "f_n_low", "f_e_low", "f_d_low", "f_n_high", "f_e_high", "f_d_high", "f_roll", "f_pitch",
     "half_width", "guarantee", "empty", "inflations", "authority", "given_back_n", "given_back_e", "given_back_d",
     "thrust",  # specific, as the model thinks it acts: what f is measured against
 )  # fmt: skip

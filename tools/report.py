@@ -235,11 +235,14 @@ def _rates(m: Material) -> list[str]:
 def _disturbance(m: Material) -> list[str]:
     """True, estimated and bounded; the bounds of whoever publishes them."""
     t_true, t, figures = _s(m.truth.t_us), _s(m.trace.column("t_us")), []
-    for axis, name in _AXES:
+    real = score.model_error(m.trace, m.truth) if "asmf f_n" in m.trace.names else None
+    for i, (axis, name) in enumerate(_AXES):
         traces: list[Any] = []
         for low, high, who in _bounds(m.trace.names, axis):
             traces += html.band(f"bounds, {who}", t, m.trace.column(low), m.trace.column(high))
         traces.append(html.line("true", t_true, m.truth.extra[f"f_{axis}"], 5, width=2.5))
+        if real is not None:
+            traces.append(html.line("true, against asmf's model", t, real[:, i], 6))
         estimates = [("estimator", f"f_{axis}"), ("asmf", f"asmf f_{axis}")]
         for k, (who, column) in enumerate(estimates):
             if column in m.trace.names and np.isfinite(m.trace.column(column)).any():
@@ -249,6 +252,11 @@ def _disturbance(m: Material) -> list[str]:
     if not np.isfinite(m.trace.column("f_n")).any():
         figures.insert(0, html.text("The estimator of this flight estimates no disturbance.", "quiet"))
     note = "The true disturbance is what acts beside gravity and the thrust that the rotors would give in still air."
+    if real is not None:
+        note += (
+            " The bounds are those of what the compensator's model lacks, thrust included: guaranteed while the stated noise and"
+            " rate bounds hold; the flag says when the data contradict them."
+        )
     return [html.text(note, "quiet"), *figures, html.figure("Wind", wind, x=_TIME, y="m/s", height=230, linked="time")]
 
 

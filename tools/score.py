@@ -98,6 +98,38 @@ def rate_scores(trace: Trace, true: Truth, use: NDArray[np.bool_], gyro: NDArray
     return scores
 
 
+def model_error(trace: Trace, true: Truth) -> Array:
+    """What the compensator's model really lacked (n, 3) NED [m/s^2]: the disturbance, and thrust other than the model thinks."""
+    t_us = trace.column("t_us")
+    w, x, y, z = at(true.t_us, true.q_wxyz, t_us).T
+    axis = np.column_stack([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)])
+    missing = trace.column("asmf thrust") - np.interp(t_us, true.t_us, true.extra["thrust"])
+    force = np.column_stack([np.interp(t_us, true.t_us, true.extra[f"f_{i}"]) for i in "ned"])
+    return force + missing[:, None] * axis
+
+
+def bounds_scores(trace: Trace, true: Truth) -> dict[str, Any]:
+    """How the published bounds of the model error did: truth inside, their width, how often the data contradicted them."""
+    if "asmf f_n" not in trace.names or not len(trace.rows):
+        return {}
+    real = model_error(trace, true)
+    low, high = (np.column_stack([trace.column(f"asmf f_{i}_{side}") for i in "ned"]) for side in ("low", "high"))
+    known = np.isfinite(low).all(axis=1)
+    if not known.any():
+        return {}
+    inside = np.all((real >= low) & (real <= high), axis=1)[known]
+    return {
+        "bounds": {
+            "inside_pct": 100.0 * float(inside.mean()),
+            "half_width_m_s2": 0.5 * float((high - low)[known].mean()),
+            "f_error_m_s2": float(np.abs(trace.vector("asmf f") - real)[known].mean()),
+            "guarantee_pct": 100.0 * float(trace.column("asmf guarantee")[known].mean()),
+            "empty": int(trace.column("asmf empty")[-1]),
+            "inflations": int(trace.column("asmf inflations")[-1]),
+        }
+    }
+
+
 def messages_lost(log: Log, systems: set[tuple[int, int]] | None = None) -> int:
     """Gaps in the sequence numbers of every sender (or of those given), added up."""
     senders: dict[tuple[int, int], list[tuple[NDArray[np.int64], NDArray[np.uint8]]]] = {}

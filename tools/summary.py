@@ -81,6 +81,7 @@ def _scores(run: Path, resolved: Resolved) -> dict[str, Any]:
     return {
         **score.position_scores(score.position_error(part, true)),
         "rate_rmse_rad_s": score.rate_scores(trace, true, use, gyro),
+        **score.bounds_scores(part, true),
         "scored_s": float(np.ptp(part.column("t_us")) * 1e-6) if use.any() else 0.0,
         "engaged_s": None if start is None else 1e-6 * start,
         "control_steps": len(trace.rows),
@@ -151,6 +152,11 @@ def table(result: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         ("landed", "yes" if result["landed"] else "no"),
     ]
+    bounds = result.get("bounds")
+    if bounds:
+        held = f"hold the truth in {_n(bounds['inside_pct'], 2)} % of the steps, +-{_n(bounds['half_width_m_s2'], 2)} m/s^2"
+        said = f"contradicted {bounds['empty']} times, widened {bounds['inflations']} times"
+        rows.append(("bounds of the model error", f"{held}; {said}"))
     return rows
 
 

@@ -86,7 +86,7 @@ def test_an_unknown_push_is_cancelled_and_its_bounds_hold_it():
     assert corrected.last("distance").max() < 0.03
     for axis, push in zip("ned", PUSH, strict=True):
         settled = corrected.rows[100:]
-        assert all(row[f"low_{axis}"] <= push <= row[f"high_{axis}"] for row in settled)
+        assert all(row[f"f_{axis}_low"] <= push <= row[f"f_{axis}_high"] for row in settled)
         assert abs(corrected.last(f"f_{axis}").mean() - push) < 0.05
     assert corrected.last("guarantee").min() == 1.0
     assert corrected.last("empty")[-1] == 0.0
@@ -116,7 +116,7 @@ def test_authority_ramps_up_in_two_seconds_and_without_it_the_controller_s_own_e
 def test_a_wound_up_integral_takes_over_only_as_far_as_the_bounds_believe_it():
     loop = Loop(own_estimate=lambda _: (6.0, 0.0, 0.0))
     loop.run(6.0)
-    high = loop.rows[-1]["high_n"]
+    high = loop.rows[-1]["f_n_high"]
     loop.gains = loop.gains._replace(authority=0.0)
     loop.run(1.0)
     assert loop.rows[-1]["authority"] == 0.0
