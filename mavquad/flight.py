@@ -25,6 +25,7 @@ class Flight:
     now_us: int  # vehicle time of the newest sample
     control_us: int  # vehicle time of the last control step
     control_gap_us: int  # period of the pacing stream
+    behind: int  # samples in a row whose stamps are well behind the newest
     epoch: int  # how often the autopilot's clock has started
     stamps: dict[str, int]  # newest vehicle stamp of each kind
     due_us: int  # arrival time at which the next timer fires
@@ -100,7 +101,7 @@ def forget(plan: Plan, f: Flight) -> None:
     f.observers = tuple(s.module.init(s.gains) for s in plan.observers)
     f.now_us = f.control_us = f.sent_us = f.anchor = f.path_t0_us = 0
     f.control_gap_us = 0
-    f.stamps = {}
+    f.stamps, f.behind = {}, 0
     f.position, f.offset_m, f.origin_m, f.estimate = None, ZERO3, ZERO3, None
     f.anchor_p_m, f.anchor_yaw_rad = ZERO3, 0.0
     f.delay_echo_s, f.setpoints = math.nan, ()

@@ -25,6 +25,7 @@ __all__ = ["Flight", "Plan", "accepts", "advance", "anchor", "build", "feed", "s
 G_M_S2 = attitude.G_M_S2
 _TICK_US = 100_000  # life cycle and watchdog
 _HEARTBEAT_US = 1_000_000
+_BEHIND_US, _BEHIND_MANY = 500_000, 30  # no link delivers so many in a row so late: a clock restarted soon after it started
 _LATE_US = 2_000_000  # a stamp further back than this is a restarted clock, not a late message
 
 
@@ -344,7 +345,8 @@ def _sample(plan: Plan, f: Flight, name: str, m: Any) -> None:
     if name == "SERVO_OUTPUT_RAW":
         sample = sample._replace(t_us=decode.unwrap_us(sample.t_us, f.now_us))
     t_us = sample.t_us
-    if t_us < f.now_us - _LATE_US:
+    f.behind = f.behind + 1 if t_us < f.now_us - _BEHIND_US else 0
+    if t_us < f.now_us - _LATE_US or f.behind > _BEHIND_MANY:
         _restarted(plan, f)
     elif t_us <= f.stamps.get(name, -1):
         _count(f, f"{name} late or twice")
