@@ -2,7 +2,7 @@
 
 Example:
   mavquad report runs/20250101-120000-circle-7
-  mavquad report runs/20250101-120000-circle-7 --out /tmp/circle.html
+  mavquad report runs/20250101-120000-circle-7 --out circle.html
 """
 
 import argparse
