@@ -5,6 +5,7 @@ compensator, the observers, the simulated vehicles, the reader of logs, and what
 """
 
 import argparse
+import functools
 import importlib
 import sys
 import tempfile
@@ -111,8 +112,13 @@ def _logs() -> None:
         log.everything()
 
 
+@functools.cache
+def _sources() -> str:
+    return jit.source_hash(jit.kernel_modules())
+
+
 def _stamp(label: str) -> Path:
-    return jit.CACHE_FOLDER / f"warm {label}".replace(" ", "-").replace("/", "-")
+    return jit.base_folder() / f"warm {label} {_sources()}".replace(" ", "-").replace("/", "-")
 
 
 if __name__ == "__main__":
