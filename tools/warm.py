@@ -66,6 +66,7 @@ def steps() -> Iterator[Step]:
         yield f"controller {name}", lambda name=name: _stages(controller=name)  # type: ignore[misc]
     for name in COMPENSATORS:
         yield f"compensator {name}", lambda name=name: _stages(compensator=name)  # type: ignore[misc]
+    yield "observers over whole records", records
     for path in sorted((Path(__file__).parent / "papers").glob("*.py")):
         if "\ndef warm(" in path.read_text(encoding="utf-8"):
             yield f"paper {path.stem}", importlib.import_module(f"tools.papers.{path.stem}").warm
@@ -94,6 +95,23 @@ def vehicle() -> None:
     from sitl.simulation import Simulation
 
     Simulation(Sitl()).run_until(1_000_000)
+
+
+def records() -> None:
+    """Every observer over a record of a few samples."""
+    import numpy as np
+
+    from mavquad import active_flight, active_record, airframe
+    from mavquad.estimate import extended_state_flight, extended_state_record, gsmo, joint_flight, joint_record, record
+
+    t_us, level = 20_000 * np.arange(1, 5), np.tile([1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0], (4, 1))
+    events = record.events({kind: (t_us, t_us, level[:, : (7, 6, 6, 3)[kind]]) for kind in range(4)}, 20_000)
+    vehicle = airframe.load("x500")
+    joint_record.run(joint_flight.gains(joint_flight.Params(), vehicle), events)
+    extended_state_record.run(extended_state_flight.gains(extended_state_flight.Params(), vehicle), events)
+    active_record.run(active_flight.gains(active_flight.Params(), vehicle), events)
+    for variant in ("online", "relay"):
+        gsmo.run_record(gsmo.gains(gsmo.Params(variant=variant)), t_us, level[:, :4])
 
 
 def _logs() -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavquad.errors import LogError
+from mavquad.link.bulk import quaternions
 from mavquad.link.recording import Recording, Signal, at_times, onboard, unit
 from mavquad.signals import Attitude, Imu, Mocap, Motors, Position, Target
 
@@ -159,16 +160,3 @@ def _target(tables: dict[str, Array]) -> Signal | None:
     known = np.isfinite(thrust)
     rates, mask = np.full((known.sum(), 3), np.nan), np.full(known.sum(), 7)
     return onboard(Target, "ATT, CTUN", table["t_us"][known], q[known], rates, thrust[known], mask)
-
-
-def quaternions(angles_rad: Array) -> Array:
-    """(n, 4) from roll, pitch, yaw (n, 3): ZYX, scalar first, body to world."""
-    c, s = np.cos(0.5 * angles_rad).T, np.sin(0.5 * angles_rad).T
-    return np.column_stack(
-        [
-            c[0] * c[1] * c[2] + s[0] * s[1] * s[2],
-            s[0] * c[1] * c[2] - c[0] * s[1] * s[2],
-            c[0] * s[1] * c[2] + s[0] * c[1] * s[2],
-            c[0] * c[1] * s[2] - s[0] * s[1] * c[2],
-        ]
-    )

@@ -12,10 +12,9 @@ from typing import Any, NamedTuple, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from mavquad import wire
-from mavquad.errors import LinkError, LogError
-from mavquad.link import signals
-from mavquad.link.columns import Log, Stream
+from mavquad.errors import LogError
+from mavquad.link import bulk, signals
+from mavquad.link.columns import Log
 from mavquad.signals import Attitude, Imu, Mocap, Motors, Position, Target
 
 Array = NDArray[Any]
@@ -103,32 +102,22 @@ def _first_bytes(path: Path) -> bytes:
 
 
 def from_tlog(log: Log, *, system: int | None = None, component: int | None = None) -> Recording:
-    """The signals of one sender, decoded by the very functions the live link uses. Raises LogError where several could be meant."""
+    """The signals of one sender, as the live link would decode them. Raises LogError where several could be meant."""
     sender = _sender(log, system, component)
     tables = {f"{s.system}/{s.component}/{s.name}": rows for s, rows in log.everything().items()}
     found: dict[Kind, Signal] = {}
     refused = 0
-    for name, decode in signals.DECODERS.items():
+    for name, decode in bulk.DECODERS.items():
         for stream in log.find(name, *sender):
-            got: list[tuple[int, Any]] = []
-            for arrival_us, message in _messages(log, stream):
-                try:
-                    got.append((arrival_us, decode(message)))
-                except LinkError:
-                    refused += 1
-            if got and (type(got[0][1]) not in found or len(got) > 1.2 * len(found[type(got[0][1])].arrival_us)):
-                found[type(got[0][1])] = _signal(name, got)
+            rows = log.rows(stream)
+            kind, good, columns = decode(rows)
+            refused += int(good.size - good.sum())
+            got = Signal(kind, name, rows["t_us"][good], tuple(column[good] for column in columns))
+            if good.any() and (kind not in found or got.arrival_us.size > 1.2 * found[kind].arrival_us.size):
+                found[kind] = got
     if Motors in found and Attitude in found:
         found[Motors] = _unwrapped(found[Motors], found[Attitude])
     return Recording(log.path, "tlog", found, tables, refused, log.problem)
-
-
-def _messages(log: Log, stream: Stream) -> Iterator[tuple[int, Any]]:
-    """(arrival_us, message) of a stream, the messages as `wire.decode` gives them."""
-    rows, make = log.rows(stream), wire.spec(stream.name).make
-    fields = [rows[name] for name in (rows.dtype.names or ())[1:-1]]  # between t_us and frame_seq: in declared order
-    columns = [map(tuple, field.tolist()) if field.ndim == 2 else field.tolist() for field in fields]
-    return zip(rows["t_us"].tolist(), map(make, *columns), strict=True)
 
 
 def _sender(log: Log, system: int | None, component: int | None) -> tuple[int, int]:
@@ -140,18 +129,10 @@ def _sender(log: Log, system: int | None, component: int | None) -> tuple[int, i
     raise LogError(f"{log.path}: attitude comes from {names}; expected one vehicle: choose it with --system and --component")
 
 
-def _signal(source: str, got: list[tuple[int, Any]]) -> Signal:
-    columns = tuple(np.array(column) for column in zip(*(sample for _, sample in got), strict=True))
-    return Signal(type(got[0][1]), source, np.array([t for t, _ in got], np.int64), columns)
-
-
 def _unwrapped(motors: Signal, attitude: Signal) -> Signal:
     """Stamps of SERVO_OUTPUT_RAW in full, by those of the attitude that arrived next to them."""
-    order = np.argsort(attitude.arrival_us, kind="stable")
-    near = np.searchsorted(attitude.arrival_us[order], motors.arrival_us).clip(0, order.size - 1)
-    reference = attitude.columns[0][order][near]
-    t_us = [signals.unwrap_us(int(t), int(r)) for t, r in zip(motors.columns[0], reference, strict=True)]
-    return motors._replace(columns=(np.array(t_us, np.int64), *motors.columns[1:]))
+    t_us = bulk.unwrapped_us(motors.columns[0], motors.arrival_us, attitude.columns[0], attitude.arrival_us)
+    return motors._replace(columns=(t_us, *motors.columns[1:]))
 
 
 def samples(recording: Recording) -> Iterator[tuple[int, Any]]:
