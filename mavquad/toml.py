@@ -13,7 +13,7 @@ def dumps(data: dict[str, Any]) -> str:
 
 
 def _table(table: dict[str, Any], path: tuple[str, ...]) -> list[str]:
-    lines = [f"{_key(k)} = {_value(v)}\n" for k, v in table.items() if v is not None and not isinstance(v, dict)]
+    lines = [f"{_key(k)} = {value(v)}\n" for k, v in table.items() if v is not None and not isinstance(v, dict)]
     if path and (lines or not table):
         lines.insert(0, f"\n[{'.'.join(_key(k) for k in path)}]\n")
     for key, inner in table.items():
@@ -30,15 +30,16 @@ def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")  # as JSON, but DEL is refused by TOML
 
 
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, int | float):
-        return repr(value)
-    if isinstance(value, str):
-        return _quoted(value)
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(_value(x) for x in value)}]"
-    if isinstance(value, dict):
-        return f"{{{', '.join(f'{_key(k)} = {_value(v)}' for k, v in value.items() if v is not None)}}}"
-    raise ConfigError(f"{value!r} ({type(value).__name__}) cannot be written as TOML; expected a number, text, list or table")
+def value(what: Any) -> str:
+    """One TOML value, on one line. Raises ConfigError for a value TOML has no word for."""
+    if isinstance(what, bool):
+        return str(what).lower()
+    if isinstance(what, int | float):
+        return repr(what)
+    if isinstance(what, str):
+        return _quoted(what)
+    if isinstance(what, list | tuple):
+        return f"[{', '.join(value(x) for x in what)}]"
+    if isinstance(what, dict):
+        return f"{{{', '.join(f'{_key(k)} = {value(v)}' for k, v in what.items() if v is not None)}}}"
+    raise ConfigError(f"{what!r} ({type(what).__name__}) cannot be written as TOML; expected a number, text, list or table")

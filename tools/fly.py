@@ -54,11 +54,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """One flight. 0 where it went well, 1 where not."""
     from mavquad import plan
-    from tools import flight, scenarios, summary, warm
+    from tools import flight, summary, warm
 
     if args.speed is not None and not 0.01 <= args.speed <= 1000.0:
         raise FlightError(f"--speed {args.speed}: expected 0.01 to 1000 times real time, or no --speed for lockstep")
-    resolved = scenarios.resolve(scenarios.load(args.scenario, [*args.set, *_axes(args)]), _options(args))
+    resolved = resolve(args)
     plan.build(resolved.companion)  # what is wrong with it is known before anything starts
     name = Path(args.scenario).stem
     folder = args.run or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}-{args.seed}"
@@ -66,10 +66,10 @@ def run(args: argparse.Namespace) -> int:
     max_time_s = resolved.scenario.flight.max_time_s
     signal.signal(signal.SIGTERM, _terminated)
     with Progress(summary.path_duration_s(resolved.companion), quiet=args.json) as progress:
-        warm.ensure(f"flight {_stages(resolved.companion)}", lambda: warm.flight(resolved), progress.say)
+        warm.ensure(f"flight {stages(resolved.companion)}", lambda: warm.flight(resolved), progress.say)
         flown = flight.fly(folder, flight.Pace(args.speed), max_time_s, progress.watch)
         progress.say("scoring")
-        result = summary.summarise(folder, name, resolved, flown, _command(args), args.speed is None)
+        result = summary.summarise(folder, name, resolved, flown, command(args), args.speed is None)
         if not args.no_report and not flown.problems:
             from tools import report
 
@@ -97,10 +97,11 @@ def _axes(args: argparse.Namespace) -> list[str]:
     return [f"sweep.axes={json.dumps(axes)}", f"path.duration_s={seconds + 3.0:.0f}"]
 
 
-def _options(args: argparse.Namespace) -> Any:
-    from tools.scenarios import Options
+def resolve(args: argparse.Namespace) -> Any:
+    """The configurations of both programs, from the options. Raises ConfigError."""
+    from tools import scenarios
 
-    return Options(
+    options = scenarios.Options(
         seed=args.seed,
         airframe=args.airframe,
         personality=args.personality,
@@ -111,14 +112,16 @@ def _options(args: argparse.Namespace) -> Any:
         observers=args.observer,
         loop=args.loop,
     )
+    return scenarios.resolve(scenarios.load(args.scenario, [*args.set, *_axes(args)]), options)
 
 
-def _stages(companion: Any) -> str:
+def stages(companion: Any) -> str:
+    """The names of what flies: which kernels must be compiled."""
     names = (companion.controller, companion.estimator, companion.compensator, *companion.observers)
     return " ".join(name.replace(":", " ").replace(",", " ") for name in names)
 
 
-def _command(args: argparse.Namespace) -> str:
+def command(args: argparse.Namespace) -> str:
     """The command that repeats this flight."""
     words = ["mavquad", "fly", args.scenario, "--seed", str(args.seed)]
     for name in ("personality", "airframe", "controller", "estimator", "compensator", "attitude", "loop", "speed"):

@@ -3,6 +3,7 @@
 A scenario is a TOML file of `scenario/` (or a user's own) over the standard conditions, which are the defaults of the simulated
 autopilot's own types; then changed by `--set`:
   vehicle.mass=+20%          the true vehicle against its file (mass, inertia, drag, thrust, motor_lag, or any key of the file)
+  faults=[{kind = "motor", motor = 1, effectiveness = 0.8, t_s = 20}]
   wind.mean_m_s=5            also noise, link, start, params, path, flight, require: tables of the scenario
   limits.tilt_deg=30        also safety: tables of the companion; companion.control_hz=250: its own keys
   pid.ki=0.4                 any other table tunes the stage of that name
@@ -153,6 +154,8 @@ def _set(data: dict[str, Any], change: str) -> dict[str, Any]:
     """One --set, sent to the table it means."""
     key, equals, text = change.partition("=")
     first, dot, rest = key.strip().partition(".")
+    if equals and key.strip() == "faults":  # a list of tables: as a whole
+        return config.override(data, change)
     if not (equals and dot and rest):
         raise ConfigError(f"--set {change}: expected TABLE.KEY=VALUE, e.g. vehicle.mass=+20% or wind.mean_m_s=5")
     if first == "vehicle":

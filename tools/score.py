@@ -130,6 +130,39 @@ def bounds_scores(trace: Trace, true: Truth) -> dict[str, Any]:
     }
 
 
+def disturbance_scores(trace: Trace, true: Truth) -> dict[str, Any]:
+    """How the estimated disturbance acceleration follows the true one, over the axes together, each less its mean.
+
+    correlation at once; lag_s: the delay (0 to 1 s) at which the estimate fits best, and the correlation there; rms error [m/s^2].
+    Nothing where the flight has no estimate, or nothing to follow.
+    """
+    estimate, t_us = trace.vector("f"), trace.column("t_us")
+    known = np.isfinite(estimate).all(axis=1)
+    if known.sum() < 100:
+        return {}
+    estimate, t_us = estimate[known], t_us[known]
+
+    def real(lag_s: float) -> Array:
+        force = [np.interp(t_us - 1e6 * lag_s, true.t_us, true.extra[f"f_{i}"]) for i in "ned"]
+        return np.column_stack(force)
+
+    def correlation(lag_s: float) -> float:
+        a, b = real(lag_s), estimate
+        a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+        size = float(np.sqrt(np.sum(a**2) * np.sum(b**2)))
+        return float(np.sum(a * b)) / size if size > 0.0 else math.nan
+
+    lags = np.arange(0.0, 1.0, 0.01)
+    found = [correlation(lag) for lag in lags]
+    if not np.isfinite(found).all():
+        return {}
+    best = int(np.argmax(found))
+    error = float(np.sqrt(np.mean(np.sum((estimate - real(0.0)) ** 2, axis=1))))
+    return {
+        "disturbance": {"correlation": found[0], "lag_s": float(lags[best]), "best": found[best], "error_m_s2": error},
+    }
+
+
 def messages_lost(log: Log, systems: set[tuple[int, int]] | None = None) -> int:
     """Gaps in the sequence numbers of every sender (or of those given), added up."""
     senders: dict[tuple[int, int], list[tuple[NDArray[np.int64], NDArray[np.uint8]]]] = {}

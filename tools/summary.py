@@ -81,6 +81,7 @@ def _scores(run: Path, resolved: Resolved) -> dict[str, Any]:
     return {
         **score.position_scores(score.position_error(part, true)),
         "rate_rmse_rad_s": score.rate_scores(trace, true, use, gyro),
+        **score.disturbance_scores(part, true),
         **score.bounds_scores(part, true),
         "scored_s": float(np.ptp(part.column("t_us")) * 1e-6) if use.any() else 0.0,
         "engaged_s": None if start is None else 1e-6 * start,
@@ -152,6 +153,12 @@ def table(result: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         ("landed", "yes" if result["landed"] else "no"),
     ]
+    force = result.get("disturbance")
+    if force:
+        follows = f"follows the true one with correlation {_n(force['correlation'])}, {_n(1e3 * force['lag_s'], 0)} ms behind"
+        rows.append(
+            ("disturbance estimate", f"{follows} (then {_n(force['best'])}), rms error {_n(force['error_m_s2'], 2)} m/s^2")
+        )
     bounds = result.get("bounds")
     if bounds:
         held = f"hold the truth in {_n(bounds['inside_pct'], 2)} % of the steps, +-{_n(bounds['half_width_m_s2'], 2)} m/s^2"

@@ -1,0 +1,61 @@
+"""A campaign's flights as two real processes over UDP, each by the same code as `mavquad fly`; its run folder goes unless kept."""
+
+import argparse
+import functools
+import shutil
+from pathlib import Path
+from typing import Any
+
+from mavquad.errors import MavquadError
+from tools import flight, fly, summary, warm
+from tools.campaigns.grid import Flight
+from tools.campaigns.store import Result
+
+NAME = "udp"
+CHUNK = 1  # flights handed to a worker at once
+
+
+@functools.cache
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(exit_on_error=False)
+    fly.add_arguments(parser)
+    return parser
+
+
+def resolve(words: tuple[str, ...]) -> tuple[argparse.Namespace, Any]:
+    """(the options of `mavquad fly`, both programs' configurations). Raises ConfigError."""
+    args = _parser().parse_args(words)
+    return args, fly.resolve(args)
+
+
+def prepare(flights: list[Flight], say: Any) -> None:
+    """Check every kind of flight and compile what it needs, once, before any worker starts. Raises ConfigError."""
+    from mavquad import plan
+
+    kinds = {(one.scenario, one.personality, one.variant): one for one in reversed(flights)}
+    found = [resolve(one.words)[1] for one in kinds.values()]
+    for resolved in found:
+        plan.build(resolved.companion)
+    for resolved in found:
+        warm.ensure(f"flight {fly.stages(resolved.companion)}", functools.partial(warm.flight, resolved), say)
+
+
+def fly_chunk(words: list[tuple[str, ...]], ids: list[str], runs: str, keep: str) -> list[Result]:
+    """Fly each in a folder of its own under `runs`; keep none, the failed or all of the folders."""
+    return [_one(one, Path(runs) / id_, keep) for one, id_ in zip(words, ids, strict=True)]
+
+
+def _one(words: tuple[str, ...], run: Path, keep: str) -> Result:
+    shutil.rmtree(run, ignore_errors=True)  # of a flight that was cut short
+    try:
+        args, resolved = resolve(words)
+        flight.prepare(run, resolved)
+        max_time_s = resolved.scenario.flight.max_time_s
+        flown = flight.fly(run, flight.Pace(args.speed), max_time_s, lambda t_s, said: None)
+        name = Path(args.scenario).stem
+        result = Result(run.name, summary.summarise(run, name, resolved, flown, fly.command(args), args.speed is None))
+    except MavquadError as error:
+        result = Result(run.name, {}, str(error))
+    if keep == "none" or (keep == "failed" and result.summary.get("ok")):
+        shutil.rmtree(run, ignore_errors=True)
+    return result
