@@ -1,6 +1,6 @@
 """The live shell: endpoint + clock + pipeline + log. It owns everything that ages; nothing below it asks whether it is live.
 
-Every accepted frame is logged before it is acted on, every sent frame before it is sent. In lockstep the clock is the barrier:
+Every accepted frame is logged before it is acted on, every sent frame before it is sent (frames of a datagram in one write). In lockstep the clock is the barrier:
 all frames of a period carry its stamp (architecture, section 3).
 """
 
@@ -115,29 +115,39 @@ class Companion:
             self._address_us = stamp_us
         return True
 
-    def take(self, frame: Frame, address: Address, stamp_us: int) -> None:
-        """Log a frame, act on it, log what it makes us say."""
-        if not self._accepts(frame, address, stamp_us):
+    def take(self, frames: list[Frame], address: Address, stamp_us: int) -> None:
+        """Log frames that arrived together, act on them, log what they make us say.
+
+        Until our autopilot is known one at a time: which frames are accepted depends on it.
+        """
+        if self.flight.life.target == (0, 0) and len(frames) > 1:
+            for frame in frames:
+                self.take([frame], address, stamp_us)
             return
-        key = (frame.system, frame.component)
-        self.sources[key] = health.on_frame(self.sources.get(key), frame.seq)
-        self.received += 1
-        self._act(frame, stamp_us)
-        if self._address is None and key == self.flight.life.target:
+        accepted = [frame for frame in frames if self._accepts(frame, address, stamp_us)]
+        if not accepted:
+            return
+        self.received += len(accepted)
+        sources = self.sources
+        for frame in accepted:
+            key = (frame.system, frame.component)
+            sources[key] = health.on_frame(sources.get(key), frame.seq)
+        self._act(accepted, stamp_us)
+        if self._address is None and self.flight.life.target in sources:
             self._address, self._address_us = address, stamp_us
 
-    def _act(self, frame: Frame, stamp_us: int) -> None:
+    def _act(self, frames: list[Frame], stamp_us: int) -> None:
         if stamp_us >= self.flight.due_us:  # timers first: they are logged at their own due time
             self._emit(pipeline.advance(self.plan, self.flight, stamp_us))
-        self.log.write(stamp_us, frame.raw)
-        self._emit(pipeline.feed(self.plan, self.flight, stamp_us, frame))
+        self.log.write_all([(stamp_us, frame.raw) for frame in frames])
+        self._emit(pipeline.feed_all(self.plan, self.flight, stamp_us, frames))
 
     def _emit(self, flight: Flight) -> None:
         before, self.flight = self.flight, flight
         if flight is before:
             return
-        for stamp_us, raw in flight.outbox:
-            self.log.write(stamp_us, raw)
+        self.log.write_all(flight.outbox)
+        for _, raw in flight.outbox:
             self._to_send.append(raw)
             self.setpoints += int.from_bytes(raw[7:10], "little") in _SETPOINTS
         for row in flight.trace:
@@ -164,7 +174,7 @@ class Companion:
     def _want_engage(self, stamp_us: int) -> None:
         if self._engage and self.flight.life.state == lifecycle.OBSERVING:
             self._engage = False
-            self._act(request(lifecycle.CMD_ENGAGE, self.plan, 0), stamp_us)
+            self._act([request(lifecycle.CMD_ENGAGE, self.plan, 0)], stamp_us)
 
     # ---- the two loops --------------------------------------------------------------------------------------------
     def stop(self, *_: int | FrameType | None) -> None:
@@ -214,8 +224,7 @@ class Companion:
             self._stamp_us = max(self._stamp_us, clock.wall_us())
             for data, address in arrived:
                 before = self.setpoints
-                for frame in self._frames(data, address):
-                    self.take(frame, address, self._stamp_us)
+                self.take(self._frames(data, address), address, self._stamp_us)
                 self._flush()
                 if self.setpoints > before:
                     self.latency_us.append(1e6 * (clock.monotonic_s() - begun))
@@ -283,10 +292,9 @@ class Companion:
     def _period(self, address: Address, begun: float) -> None:
         before = self.setpoints
         frames, self._waiting = self._waiting, []
-        for frame in frames[:-1]:
-            self.take(frame, address, self._stamp_us)
+        self.take(frames[:-1], address, self._stamp_us)
         self._want_engage(self._stamp_us)
-        self.take(frames[-1], address, self._stamp_us)  # its answer ends the period
+        self.take(frames[-1:], address, self._stamp_us)  # its answer ends the period
         self._flush()
         if self.setpoints > before:
             self.latency_us.append(1e6 * (clock.monotonic_s() - begun))

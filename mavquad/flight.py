@@ -1,4 +1,4 @@
-"""All that changes in a flight: one state, copied by every event, whose parts are immutable."""
+"""All that changes in a flight: one state, copied by every event."""
 
 import difflib
 import math
@@ -13,7 +13,10 @@ from mavquad.signals import ZERO3, Estimate, Position, Setpoint, Target, Vec3
 
 
 class Flight:
-    """All that changes. `feed` and `advance` copy it, so a state that was handed in is never changed; its parts are immutable."""
+    """All that changes. `feed` and `advance` copy it, so a state that was handed in is never changed.
+
+    Its parts are immutable, but for the dicts and the lists, which are copied or emptied with it.
+    """
 
     life: Life
     estimator: Any
@@ -27,7 +30,10 @@ class Flight:
     control_gap_us: int  # period of the pacing stream
     behind: int  # samples in a row whose stamps are well behind the newest
     epoch: int  # how often the autopilot's clock has started
-    stamps: dict[str, int]  # newest vehicle stamp of each kind
+    stamps: dict[str, int]  # newest vehicle stamp of each message
+    arrivals: dict[str, int]  # and when it arrived
+    newest_arrival_us: int  # of the newest sample of all
+    pace_us: int  # vehicle time of the last sample of the stream that paces the control
     due_us: int  # arrival time at which the next timer fires
     heartbeat_us: int  # next due, arrival time; 0: not started
     tick_us: int
@@ -63,8 +69,10 @@ class Flight:
     def clone(self) -> "Flight":
         """A copy to be changed, with nothing to be sent yet."""
         other = Flight.__new__(Flight)
-        other.__dict__.update(self.__dict__)
-        other.outbox, other.trace = [], []
+        values = other.__dict__
+        values.update(self.__dict__)
+        values["stamps"], values["arrivals"], values["counts"] = self.stamps.copy(), self.arrivals.copy(), self.counts.copy()
+        values["outbox"], values["trace"] = [], []
         return other
 
 
@@ -101,10 +109,16 @@ def forget(plan: Plan, f: Flight) -> None:
     f.observers = tuple(s.module.init(s.gains) for s in plan.observers)
     f.now_us = f.control_us = f.sent_us = f.anchor = f.path_t0_us = 0
     f.control_gap_us = 0
-    f.stamps, f.behind = {}, 0
+    f.stamps, f.arrivals, f.behind = {}, {}, 0
+    f.newest_arrival_us = f.pace_us = 0
     f.position, f.offset_m, f.origin_m, f.estimate = None, ZERO3, ZERO3, None
     f.anchor_p_m, f.anchor_yaw_rad = ZERO3, 0.0
     f.delay_echo_s, f.setpoints = math.nan, ()
     f.own_attitude_loop = None
     f.sent, f.echo, f.applied_thrust_m_s2 = None, None, G_M_S2
     f.lateness_us, f.late_us = 1 << 62, 0
+
+
+def vehicle_now_us(f: Flight) -> int:
+    """Vehicle time at the last event, carried on from the newest sample by the arrival clock."""
+    return f.now_us + max(0, f.arrival_us - f.newest_arrival_us) if f.now_us else 0

@@ -2,8 +2,8 @@
 
 import math
 
+from mavquad import control_step, lifecycle, pipeline, wire
 from mavquad import flight as flights
-from mavquad import lifecycle, pipeline, wire
 from mavquad.plan import Plan
 
 _STEP_US = 20_000
@@ -23,7 +23,7 @@ def run(plan: Plan) -> int:
         if k == 10:  # straight to flying, without an autopilot to ask
             f = f.clone()
             f.life = f.life._replace(state=lifecycle.STREAMING, armed=True, mode=6 << 16, autopilot=lifecycle.PX4)
-            pipeline.anchor(plan, f)
+            control_step.anchor(plan, f)
     return steps
 
 

@@ -15,33 +15,34 @@ Sample = Attitude | Imu | Mocap | Motors | Position | Target
 _SERVO_WRAP_US = 1 << 32
 
 
-def _unit(name: str, stamp: str, w: float, x: float, y: float, z: float) -> Quat:
+def _unit(name: str, stamp: int, unit: str, q: Quat) -> Quat:
+    w, x, y, z = q
     n2 = w * w + x * x + y * y + z * z
     if not 0.9 < n2 < 1.1:  # also NaN
-        raise LinkError(
-            f"{name} at {stamp} has |q| = {math.sqrt(n2) if n2 >= 0 else n2:.4f}, expected 1 +/- 0.05; sample refused"
-        )
+        size = math.sqrt(n2) if n2 >= 0 else n2
+        raise LinkError(f"{name} at {stamp} {unit} has |q| = {size:.4f}, expected 1 +/- 0.05; sample refused")
     k = 1.0 / math.sqrt(n2)
     return (k * w, k * x, k * y, k * z)
 
 
-def _finite(name: str, stamp: str, *values: float) -> None:
+def _finite(name: str, stamp: int, unit: str, *values: float) -> None:
+    if math.isfinite(sum(values)):
+        return
     for value in values:
         if not math.isfinite(value):
-            raise LinkError(f"{name} at {stamp} holds {value}, expected finite numbers; sample refused")
+            raise LinkError(f"{name} at {stamp} {unit} holds {value}, expected finite numbers; sample refused")
 
 
 def attitude_quaternion(m: Any) -> Attitude:
     """ATTITUDE_QUATERNION (#31): ms -> us; rates already rad/s in FRD."""
-    stamp = f"{m.time_boot_ms} ms"
-    _finite("ATTITUDE_QUATERNION", stamp, m.rollspeed, m.pitchspeed, m.yawspeed)
-    q = _unit("ATTITUDE_QUATERNION", stamp, m.q1, m.q2, m.q3, m.q4)
-    return Attitude(1000 * m.time_boot_ms, q, (m.rollspeed, m.pitchspeed, m.yawspeed))
+    ms, w, x, y, z, p, q, r = m[:8]
+    _finite("ATTITUDE_QUATERNION", ms, "ms", p, q, r)
+    return Attitude(1000 * ms, _unit("ATTITUDE_QUATERNION", ms, "ms", (w, x, y, z)), (p, q, r))
 
 
 def attitude(m: Any) -> Attitude:
     """ATTITUDE (#30): ZYX Euler angles."""
-    _finite("ATTITUDE", f"{m.time_boot_ms} ms", m.roll, m.pitch, m.yaw, m.rollspeed, m.pitchspeed, m.yawspeed)
+    _finite("ATTITUDE", m.time_boot_ms, "ms", m.roll, m.pitch, m.yaw, m.rollspeed, m.pitchspeed, m.yawspeed)
     cr, sr = math.cos(0.5 * m.roll), math.sin(0.5 * m.roll)
     cp, sp = math.cos(0.5 * m.pitch), math.sin(0.5 * m.pitch)
     cy, sy = math.cos(0.5 * m.yaw), math.sin(0.5 * m.yaw)
@@ -56,21 +57,22 @@ def attitude(m: Any) -> Attitude:
 
 def mocap(m: Any) -> Mocap:
     """ATT_POS_MOCAP (#138): already us, NED, FRD."""
-    stamp = f"{m.time_usec} us"
-    _finite("ATT_POS_MOCAP", stamp, m.x, m.y, m.z)
-    return Mocap(m.time_usec, _unit("ATT_POS_MOCAP", stamp, *m.q), (m.x, m.y, m.z))
+    _finite("ATT_POS_MOCAP", m.time_usec, "us", m.x, m.y, m.z)
+    return Mocap(m.time_usec, _unit("ATT_POS_MOCAP", m.time_usec, "us", m.q), (m.x, m.y, m.z))
 
 
 def imu(m: Any) -> Imu:
     """HIGHRES_IMU (#105): us, m/s^2, rad/s, FRD. Its magnetometer is not used."""
-    _finite("HIGHRES_IMU", f"{m.time_usec} us", m.xacc, m.yacc, m.zacc, m.xgyro, m.ygyro, m.zgyro)
-    return Imu(m.time_usec, (m.xacc, m.yacc, m.zacc), (m.xgyro, m.ygyro, m.zgyro))
+    us, ax, ay, az, p, q, r = m[:7]
+    _finite("HIGHRES_IMU", us, "us", ax, ay, az, p, q, r)
+    return Imu(us, (ax, ay, az), (p, q, r))
 
 
 def position(m: Any) -> Position:
     """LOCAL_POSITION_NED (#32): ms -> us; metres, m/s."""
-    _finite("LOCAL_POSITION_NED", f"{m.time_boot_ms} ms", m.x, m.y, m.z, m.vx, m.vy, m.vz)
-    return Position(1000 * m.time_boot_ms, (m.x, m.y, m.z), (m.vx, m.vy, m.vz))
+    ms, n, e, d, vn, ve, vd = m
+    _finite("LOCAL_POSITION_NED", ms, "ms", n, e, d, vn, ve, vd)
+    return Position(1000 * ms, (n, e, d), (vn, ve, vd))
 
 
 def motors(m: Any) -> Motors:
@@ -81,9 +83,8 @@ def motors(m: Any) -> Motors:
 
 def target(m: Any) -> Target:
     """ATTITUDE_TARGET (#83): the attitude setpoint the autopilot acts on."""
-    stamp = f"{m.time_boot_ms} ms"
-    _finite("ATTITUDE_TARGET", stamp, m.thrust)
-    q = _unit("ATTITUDE_TARGET", stamp, *m.q)
+    _finite("ATTITUDE_TARGET", m.time_boot_ms, "ms", m.thrust)
+    q = _unit("ATTITUDE_TARGET", m.time_boot_ms, "ms", m.q)
     return Target(1000 * m.time_boot_ms, q, (m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate), m.thrust, m.type_mask)
 
 

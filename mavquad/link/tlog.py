@@ -1,6 +1,6 @@
 """tlog bytes <-> (t_us, frame): each record is an 8-byte big-endian stamp in microseconds and one raw MAVLink frame.
 
-Writing is one unbuffered write per frame, so that a killed program leaves a log that is whole to its last frame. Reading streams
+Writing is unbuffered, so that a killed program leaves a log that is whole to its last frame. Reading streams
 over any binary stream: junk between records is skipped and counted, and whatever is wrong with a file is said after every whole
 message in it was handed out. Whole logs as columns: `mavquad.link.columns`.
 """
@@ -47,7 +47,7 @@ class Writer:
         self._put(t_us, t_us.to_bytes(STAMP, "big") + raw)
 
     def write_all(self, records: list[tuple[int, bytes]]) -> None:
-        """Many frames in one write, for a program that may lose them together when it is killed. Raises LogError as `write`."""
+        """Many frames in one write: those of a datagram, or of a moment. Raises LogError as `write`."""
         if records:
             self._put(records[-1][0], b"".join([t_us.to_bytes(STAMP, "big") + raw for t_us, raw in records]))
 

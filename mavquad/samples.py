@@ -1,0 +1,125 @@
+"""A sample from the autopilot: late, repeated or of a restarted clock, else into every stage; the attitude paces the control. Pure."""
+
+import math
+from typing import Any
+
+from mavquad import control_step, lifecycle, outbox, wire
+from mavquad.errors import LinkError
+from mavquad.flight import Flight, forget
+from mavquad.lifecycle import ENGAGED, OBSERVING, STREAMING
+from mavquad.link import signals as decode
+from mavquad.plan import Plan
+from mavquad.signals import Attitude, Position, Target
+from mavquad.wire import Frame
+
+_BEHIND_US, _BEHIND_MANY = 500_000, 30  # no link delivers so many in a row so late: a clock restarted soon after it started
+_LATE_US = 2_000_000  # a stamp further back than this is a restarted clock, not a late message
+_DOUBLED_US = 500_000  # ATTITUDE is left out while the quaternion was heard so recently
+
+
+def take(plan: Plan, f: Flight, name: str, frame: Frame) -> None:
+    """One message of the autopilot that some stage uses."""
+    if name == "ATTITUDE" and f.arrival_us - f.arrivals.get("ATTITUDE_QUATERNION", -_DOUBLED_US) < _DOUBLED_US:
+        return  # the quaternion says the same, more often and without angles
+    try:
+        sample: Any = decode.DECODERS[name](wire.decode(frame))
+    except LinkError:
+        outbox.count(f, f"{name} refused")
+        return
+    if name == "SERVO_OUTPUT_RAW":
+        sample = sample._replace(t_us=decode.unwrap_us(sample.t_us, f.now_us))
+    t_us = sample.t_us
+    f.behind = f.behind + 1 if t_us < f.now_us - _BEHIND_US else 0
+    if t_us < f.now_us - _LATE_US or f.behind > _BEHIND_MANY:
+        _restarted(plan, f)
+    elif t_us <= f.stamps.get(name, -1):
+        outbox.count(f, f"{name} late or twice")
+        return
+    f.stamps[name], f.arrivals[name] = t_us, f.arrival_us
+    if t_us > f.now_us:
+        f.now_us, f.newest_arrival_us = t_us, f.arrival_us
+    kind = type(sample)
+    if kind is Position:
+        sample = _continuous(plan, f, sample)
+    elif kind is Target:
+        f.echo = sample
+        _learn_hover(f, sample)
+        _recognise(f, sample)
+    f.estimator = plan.estimator.module.observe(plan.estimator.gains, f.estimator, sample)
+    if plan.compensator is not None:
+        f.compensator = plan.compensator.module.observe(plan.compensator.gains, f.compensator, sample)
+    if plan.observers:
+        f.observers = tuple(
+            [s.module.observe(s.gains, state, sample) for s, state in zip(plan.observers, f.observers, strict=True)]
+        )
+    if kind is Attitude:
+        _pace(f)
+        _punctual(plan, f, t_us)
+        gap_us = t_us - f.control_us
+        if not f.control_us or gap_us >= plan.control_us - f.control_gap_us // 2:
+            control_step.step(plan, f, t_us, min(0.2, 1e-6 * gap_us) if f.control_us else 1e-6 * plan.control_us)
+
+
+def _pace(f: Flight) -> None:
+    """The period of the stream that paces the control."""
+    gap = f.now_us - f.pace_us if f.pace_us else 0
+    f.pace_us = f.now_us
+    if 0 < gap < 200_000:
+        f.control_gap_us = gap if not f.control_gap_us else min(gap, f.control_gap_us)
+
+
+def _punctual(plan: Plan, f: Flight, t_us: int) -> None:
+    """Our own lateness: arrival against stamp, beside the best seen (which may creep up, clocks drift)."""
+    offset = f.arrival_us - t_us
+    f.lateness_us = min(offset, f.lateness_us + 20)
+    if offset - f.lateness_us > round(1e6 * plan.settings.safety.late_s):
+        f.late_us = f.late_us or f.arrival_us
+    else:
+        f.late_us = 0
+
+
+def _restarted(plan: Plan, f: Flight) -> None:
+    """The autopilot's clock went back by more than a late message could: it has restarted."""
+    forget(plan, f)
+    f.epoch += 1
+    outbox.count(f, "autopilot restarts")
+    if f.life.state in (STREAMING, ENGAGED):
+        outbox.release(plan, f, "autopilot restarted")
+    life = lifecycle.init(plan.settings)
+    f.life = life._replace(rates=tuple(r._replace(granted_hz=math.nan) for r in f.life.rates), said="")
+    outbox.say(plan, f, "autopilot restarted, beginning again", 4)
+
+
+def _continuous(plan: Plan, f: Flight, sample: Position) -> Position:
+    """The position without the autopilot's own resets: a jump that velocity cannot explain moves our frame, not the vehicle."""
+    p = (sample.p_ned_m[0] - f.offset_m[0], sample.p_ned_m[1] - f.offset_m[1], sample.p_ned_m[2] - f.offset_m[2])
+    last = f.position
+    if last is not None:
+        dt_s = 1e-6 * (sample.t_us - last.t_us)
+        jump = [p[i] - last.p_ned_m[i] - 0.5 * dt_s * (sample.v_ned_m_s[i] + last.v_ned_m_s[i]) for i in range(3)]
+        if max(abs(x) for x in jump) > plan.settings.safety.reset_m + 2.0 * dt_s and f.life.state in (STREAMING, ENGAGED):
+            f.offset_m = (f.offset_m[0] + jump[0], f.offset_m[1] + jump[1], f.offset_m[2] + jump[2])
+            p = (p[0] - jump[0], p[1] - jump[1], p[2] - jump[2])
+            outbox.count(f, "position resets")
+            outbox.say(plan, f, f"position reset of {math.hypot(*jump):.2f} m", 4)
+    f.position = sample._replace(p_ned_m=p)
+    return f.position
+
+
+def _learn_hover(f: Flight, target: Target) -> None:
+    """In the hover before setpoints flow, the thrust the autopilot holds is what carries this vehicle."""
+    if f.life.steady_us and f.life.state == OBSERVING and 0.05 < target.thrust < 0.95:
+        q = target.q_wxyz
+        upright = 1.0 - 2.0 * (q[1] * q[1] + q[2] * q[2])
+        f.hover_thrust += 0.05 * (target.thrust * upright - f.hover_thrust)
+
+
+def _recognise(f: Flight, target: Target) -> None:
+    """The echo of a setpoint of ours tells how long it took to get there; an autopilot that shapes its targets never echoes one."""
+    _, x, y, _ = target.q_wxyz
+    for t_us, sent_x, sent_y in f.setpoints:
+        if abs(x - sent_x) < 1e-6 and abs(y - sent_y) < 1e-6 and abs(x) + abs(y) > 1e-4:
+            delay_s = 1e-6 * (target.t_us - t_us)
+            if 0.0 <= delay_s < 1.0:
+                f.delay_echo_s = delay_s if math.isnan(f.delay_echo_s) else f.delay_echo_s + 0.05 * (delay_s - f.delay_echo_s)
+            return
