@@ -5,6 +5,7 @@ all frames of a period carry its stamp (architecture, section 3).
 """
 
 import bisect
+import gc
 import itertools
 import json
 import math
@@ -110,28 +111,29 @@ class Companion:
                 self._address = address
         if reason:
             self._refuse(frame, stamp_us, reason)
-            return False
-        if address == self._address:
-            self._address_us = stamp_us
-        return True
+        return not reason
 
     def take(self, frames: list[Frame], address: Address, stamp_us: int) -> None:
         """Log frames that arrived together, act on them, log what they make us say.
 
         Until our autopilot is known one at a time: which frames are accepted depends on it.
         """
-        if self.flight.life.target == (0, 0) and len(frames) > 1:
+        target, sources = self.flight.life.target, self.sources
+        if target == (0, 0) and len(frames) > 1:
             for frame in frames:
                 self.take([frame], address, stamp_us)
             return
-        accepted = [frame for frame in frames if self._accepts(frame, address, stamp_us)]
+        accepted = []
+        for frame in frames:
+            key = (frame.system, frame.component)
+            if (key == target and address == self._address) or self._accepts(frame, address, stamp_us):
+                accepted.append(frame)
+                sources[key] = health.on_frame(sources.get(key), frame.seq)
         if not accepted:
             return
+        if address == self._address:
+            self._address_us = stamp_us
         self.received += len(accepted)
-        sources = self.sources
-        for frame in accepted:
-            key = (frame.system, frame.component)
-            sources[key] = health.on_frame(sources.get(key), frame.seq)
         self._act(accepted, stamp_us)
         if self._address is None and self.flight.life.target in sources:
             self._address, self._address_us = address, stamp_us
@@ -185,6 +187,7 @@ class Companion:
         """Until stopped by a signal or `stop()`. The log is whole at every moment."""
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self.stop)
+        gc.freeze()  # what is loaded by now stays: a collection need not walk through it, which takes a tenth of a second
         try:
             if self.lockstep:
                 self._run_lockstep()

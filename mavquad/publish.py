@@ -88,7 +88,7 @@ def trace_row(
         *(sent.q_wxyz if sent else (math.nan,) * 4), sent.thrust if sent else math.nan, float(bits), f.hover_thrust, f.delay_s, float(f.heard_crc),
     )  # fmt: skip
     for stage, state in zip(plan.observers, f.observers, strict=True):
-        row += stage.module.read(stage.gains, state, t_us)[1]
+        row += stage.module.predict(stage.gains, state, t_us)[1]
     if plan.compensator is not None:
         row += tuple(plan.compensator.module.published(f.compensator))
     return row
@@ -105,7 +105,7 @@ def estimates(plan: "Plan", f: "Flight") -> tuple["Send", ...]:
         sends.append(("DEBUG_FLOAT_ARRAY", (f.now_us, "disturb", 2, _padded(values))))
     if plan.observers:
         stage, state = plan.observers[0], f.observers[0]
-        q, w, _ = stage.module.read(stage.gains, state, f.now_us)
+        q, w = stage.module.predict(stage.gains, state, f.now_us)
         sends.append(("DEBUG_FLOAT_ARRAY", (f.now_us, "rates", 3, _padded([*w, *q]))))
     if plan.compensator is not None:
         sends.append(

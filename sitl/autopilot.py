@@ -9,8 +9,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from mavquad.errors import ConfigError
 from sitl import rotation
 from sitl.config import ORIGIN
@@ -345,4 +343,4 @@ def check_airframe(vehicle: Vehicle) -> None:
 
 def finite(values: Any) -> bool:
     """No NaN, no infinity."""
-    return bool(np.isfinite(values).all())
+    return all(map(math.isfinite, values))

@@ -30,7 +30,7 @@ class Queue:
         self._rng = rng
         self._delay_us, self._jitter_us = round(1000.0 * link.delay_ms), 1000.0 * link.jitter_ms
         self._silences = [(round(1e6 * a), round(1e6 * b)) for a, b in link.silences]
-        self._faulty = bool(link.loss or link.duplicate or link.reorder or link.corrupt or self._silences)
+        self.faulty = bool(link.loss or link.duplicate or link.reorder or link.corrupt or self._silences)
         self._waiting: deque[tuple[int, Any]] = deque()
         self._held: list[tuple[int, int, bytes]] = []
         self._latest_us = self._holds = 0
@@ -43,15 +43,15 @@ class Queue:
         self._waiting.append((due_us, item))
         self.due_us = min(self.due_us, due_us)
 
-    def take(self, t_us: int, frame: Callable[[Any], bytes]) -> list[bytes]:
-        """Every frame that has arrived by t_us, in the order of arrival; `frame` makes one of what was put."""
+    def take(self, t_us: int, frame: Callable[[Any], Any]) -> list[Any]:
+        """Every frame that has arrived by t_us, in the order of arrival; `frame` makes one (bytes, if `faulty`) of what was put."""
         if self.due_us > t_us:
             return []
         waiting, out = self._waiting, []
         while waiting and waiting[0][0] <= t_us:
             due_us, item = waiting.popleft()
             raw = frame(item)
-            if self._faulty:
+            if self.faulty:
                 out += self._spoil(due_us, raw)
             else:
                 out.append(raw)

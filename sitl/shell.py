@@ -1,5 +1,6 @@
 """The live half: UDP sockets, wall time and the log around a `Simulation`, in lockstep or at a speed."""
 
+import gc
 import json
 import signal
 import socket
@@ -159,6 +160,7 @@ class Run:
         while not self._over():
             self.sim.run_period()
             self.ports.send()
+            self.sim.record_period()
             deadline_s = time.monotonic() + ANSWER_S
             while not self.ports.receive(_POLL_S) and not self._stop:
                 if time.monotonic() > deadline_s:
@@ -184,6 +186,8 @@ class Run:
             if ended:
                 self.sim.end_period()
             self.ports.send()
+            if ended:
+                self.sim.record_period()
 
     def report(self) -> dict[str, Any]:
         """What the run came to."""
@@ -221,6 +225,7 @@ class Run:
 
 def fly(run: Run, speed: float, out: TextIO) -> None:
     """Run to the end, whatever ends it, and print its report as one line of JSON."""
+    gc.freeze()  # what is loaded by now stays: a collection need not walk through it
     previous = {s: signal.signal(s, run.stop) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
         if run.sim.lockstep:

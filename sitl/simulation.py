@@ -95,7 +95,7 @@ class Simulation:
             if frame.msgid == _TIMESYNC and link is self.partner and self._answers(frame):
                 answered = True
             else:
-                link.up.put(self.t_us, frame.raw)
+                link.up.put(self.t_us, frame.raw if link.up.faulty else frame)
             self._log(frame.raw)
         return answered
 
@@ -123,23 +123,26 @@ class Simulation:
         return (self.t_us // self._period_us + 1) * self._period_us
 
     def run_period(self) -> None:
-        """One whole control period."""
+        """One whole control period; `record_period` when its frames were collected."""
         self.run_until(self.period_end_us)
         self.end_period()
 
     def end_period(self) -> None:
-        """At the end of a control period: a setpoint missed, the truth written, the barrier made."""
+        """At the end of a control period: a setpoint missed, the barrier made."""
         self.periods += 1
         engaged = self.autopilot.engaged
         if engaged and self._was_engaged:
             self.engaged_periods += 1
             self.misses += self.autopilot.fresh == 0
         self._was_engaged, self.autopilot.fresh = engaged, 0
+        if self.lockstep:
+            self._barrier_ns = 1000 * self.t_us
+
+    def record_period(self) -> None:
+        """The truth of this instant, and all that waits for the log: nobody waits for it, so it comes behind what is sent."""
         if self._record is not None:
             self._write_truth()
             self.flush()
-        if self.lockstep:
-            self._barrier_ns = 1000 * self.t_us
 
     def flush(self) -> None:
         """Hand over what is not recorded yet."""
@@ -161,8 +164,8 @@ class Simulation:
                 self.reboot()
             for link in links_:
                 if link.up.due_us <= now_us:
-                    for raw in link.up.take(now_us, _as_it_is):
-                        self._arrived(link, raw)
+                    for arrived in link.up.take(now_us, _as_it_is):
+                        self._arrived(link, arrived)
             if now_us >= self._tick_us:
                 self._tick_us += TICK_US
                 self._services.tick()
@@ -262,12 +265,15 @@ class Simulation:
             self._first_heartbeat = None
         return False
 
-    def _arrived(self, link: Link, raw: bytes) -> None:
-        """One frame at the end of its wire: for us, for others, or both."""
+    def _arrived(self, link: Link, arrived: Frame | bytes) -> None:
+        """One frame at the end of its wire (bytes, where the wire may have spoiled it): for us, for others, or both."""
         if self.t_us < self._silent_until_us:
             return
-        frames, refused, rest = wire.split(raw)
-        link.refused += refused + len(rest)
+        if isinstance(arrived, bytes):
+            frames, refused, rest = wire.split(arrived)
+            link.refused += refused + len(rest)
+        else:
+            frames = [arrived]
         for frame in frames:
             link.received += 1
             link.speakers.add((frame.system, frame.component))
@@ -307,5 +313,5 @@ class Simulation:
             self._log(raw)
 
 
-def _as_it_is(raw: bytes) -> bytes:
-    return raw
+def _as_it_is(item: Any) -> Any:
+    return item

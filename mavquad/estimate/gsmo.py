@@ -22,7 +22,6 @@ from mavquad import signals
 from mavquad.airframe import Airframe
 from mavquad.errors import ConfigError
 from mavquad.estimate import gsmo_core, gsmo_implicit, gsmo_members, gsmo_online, gsmo_relay, gsmo_stream, lie, torque
-from mavquad.estimate.gsmo_online import Bank
 from mavquad.estimate.gsmo_stream import Counts
 from mavquad.quat import Quat, Vec3
 
@@ -105,7 +104,7 @@ class State(NamedTuple):
 
     ints: npt.NDArray[np.int64]
     floats: npt.NDArray[np.float64]
-    bank: tuple[npt.NDArray[np.float64], ...]  # gsmo_online.Bank; empty for the other variants
+    bank: npt.NDArray[np.float64]  # gsmo_online.of it is the bank; empty for the other variants
     spin: torque.Spin
 
 
@@ -161,7 +160,7 @@ def init(gains: Gains) -> State:
     """Nothing known: the first sample gives the attitude, the rates start at zero."""
     ints, floats = np.zeros(gsmo_core.INTS, np.int64), np.zeros(gsmo_core.FLOATS)
     gsmo_core.pack_core(gsmo_core.begin((1.0, 0.0, 0.0, 0.0)), ints, floats)
-    bank = tuple(gsmo_online.new((1.0, 0.0, 0.0, 0.0))) if gains.online else ()
+    bank = gsmo_online.new((1.0, 0.0, 0.0, 0.0)) if gains.online else np.zeros(0)
     return State(ints, floats, bank, torque.AT_REST)
 
 
@@ -180,7 +179,8 @@ def observe(gains: Gains, state: State, sample: Any) -> State:
             return _bad_stamp(state)
         spun = torque.spin_up(gains.mixer, state.spin, sample.t_us, sample.command)
         spin, a = spun if spun is not None else (state.spin, signals.NAN3)
-        ints, floats = gsmo_core.torque_sample(state.ints, state.floats, sample.t_us, a)
+        ints, floats = state.ints.copy(), state.floats.copy()
+        gsmo_core.torque_sample(ints, floats, sample.t_us, a)
         return State(ints, floats, state.bank, spin)
     return state
 
@@ -190,11 +190,12 @@ def _attitude(gains: Gains, state: State, t_us: int, q_wxyz: Quat) -> State:
         return _bad_stamp(state)
     w, x, y, z = q_wxyz
     q = (float(w), float(x), float(y), float(z))
+    ints, floats, bank = state.ints.copy(), state.floats.copy(), state.bank.copy()
     if gains.online:
-        ints, floats, bank = gsmo_core.sample_online(gains.gyro, gains.tick_s, state.ints, state.floats, state.bank, t_us, q)
-        return State(ints, floats, bank, state.spin)
-    ints, floats = gsmo_core.sample(gains.fixed, state.ints, state.floats, t_us, q)
-    return State(ints, floats, state.bank, state.spin)
+        gsmo_core.sample_online(gains.gyro, gains.tick_s, ints, floats, bank, t_us, q)
+    else:
+        gsmo_core.sample(gains.fixed, ints, floats, t_us, q)
+    return State(ints, floats, bank, state.spin)
 
 
 def _bad_stamp(state: State) -> State:
@@ -208,12 +209,18 @@ def read(gains: Gains, state: State, t_us: int) -> tuple[Quat, Vec3, Health]:
 
     Before the first sample: identity, zero rates, stale.
     """
-    now_us = min(max(t_us, -gsmo_stream.MAX_STAMP_US), gsmo_stream.MAX_STAMP_US)
+    return *predict(gains, state, t_us), health(state, _near(t_us))
+
+
+def predict(gains: Gains, state: State, t_us: int) -> tuple[Quat, Vec3]:
+    """Attitude and rates as `read` gives them."""
     if gains.online:
-        q, w = gsmo_core.predict_online(gains.gyro, gains.tick_s, state.ints, state.floats, state.bank, now_us)
-    else:
-        q, w = gsmo_core.predict(gains.fixed, state.ints, state.floats, now_us)
-    return q, w, health(state, now_us)
+        return gsmo_core.predict_online(gains.gyro, gains.tick_s, state.ints, state.floats, state.bank, _near(t_us))
+    return gsmo_core.predict(gains.fixed, state.ints, state.floats, _near(t_us))
+
+
+def _near(t_us: int) -> int:
+    return min(max(t_us, -gsmo_stream.MAX_STAMP_US), gsmo_stream.MAX_STAMP_US)
 
 
 def health(state: State, t_us: int) -> Health:
@@ -226,9 +233,9 @@ def health(state: State, t_us: int) -> Health:
     periods = age_s / period_s if fresh > 1 else math.inf
     settled = fresh > 1 and (fresh - 1) * period_s >= 1.0
     noise_rad, member = math.nan, -1
-    if state.bank:
-        bank = Bank(*state.bank)
-        noise_rad, member = math.sqrt(max(float(bank.best[2]), 0.0)), int(bank.best[1])
+    if len(state.bank):
+        _, best, variance = state.bank[-3:].tolist()
+        noise_rad, member = math.sqrt(max(variance, 0.0)), int(best)
     coasting = periods > gsmo_stream.GAP_PERIODS
     return Health(counts, age_s, period_s, coasting, periods > gsmo_core.STALE_PERIODS, settled, noise_rad, member)
 

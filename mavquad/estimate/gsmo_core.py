@@ -1,7 +1,7 @@
 """One observer of the family with its sample stream, compiled: the same kernels for one sample and for a whole record.
 
-`on_attitude` serves every fixed-gain variant, `on_attitude_online` the bank. What crosses the border to Python is two flat arrays
-(and the bank's), copied there, so that a step never changes the state it was given.
+`on_attitude` serves every fixed-gain variant, `on_attitude_online` the bank. What crosses the border from Python is two flat arrays
+(and the bank's), copies that are changed in place: an array that is returned, or a named tuple, costs more than the observer.
 """
 
 import math
@@ -120,7 +120,7 @@ def on_attitude_online(gyro: Vec3, tick_s: float, stream: Stream, bank: Bank, co
     return stream
 
 
-# ---- the border to Python: plain tuples and flat arrays in, fresh arrays out ---------------------------------------------------
+# ---- the border to Python: plain tuples and flat arrays, changed in place ---------------------------------------------------
 @kernel
 def fixed(g: tuple) -> Fixed:
     """Gains from the nested plain tuple that crosses the border."""
@@ -152,36 +152,29 @@ def unpack_core(ints: np.ndarray, floats: np.ndarray) -> Core:
 
 
 @kernel
-def sample(g: tuple, ints: np.ndarray, floats: np.ndarray, t_us: int, q: Quat) -> tuple[np.ndarray, np.ndarray]:
-    """One attitude sample for a fixed-gain variant: new arrays."""
-    ints, floats = ints.copy(), floats.copy()
+def sample(g: tuple, ints: np.ndarray, floats: np.ndarray, t_us: int, q: Quat) -> None:
+    """One attitude sample for a fixed-gain variant, in place."""
     stream, core = on_attitude(fixed(g), gsmo_stream.unpack(ints, floats), unpack_core(ints, floats), ints, t_us, q)
     gsmo_stream.pack(stream, ints, floats)
     pack_core(core, ints, floats)
-    return ints, floats
 
 
 @kernel
 def sample_online(
-    gyro: Vec3, tick_s: float, ints: np.ndarray, floats: np.ndarray, bank: tuple, t_us: int, q: Quat
-) -> tuple[np.ndarray, np.ndarray, tuple]:
-    """One attitude sample for the bank: new arrays."""
-    ints, floats = ints.copy(), floats.copy()
-    after = gsmo_online.copy(Bank(*bank))
-    stream = on_attitude_online(gyro, tick_s, gsmo_stream.unpack(ints, floats), after, ints, t_us, q)
+    gyro: Vec3, tick_s: float, ints: np.ndarray, floats: np.ndarray, bank: np.ndarray, t_us: int, q: Quat
+) -> None:
+    """One attitude sample for the bank, in place."""
+    stream = on_attitude_online(gyro, tick_s, gsmo_stream.unpack(ints, floats), gsmo_online.of(bank), ints, t_us, q)
     gsmo_stream.pack(stream, ints, floats)
-    return ints, floats, (after.x, after.p, after.v, after.weight, after.scale, after.best)
 
 
 @kernel
-def torque_sample(ints: np.ndarray, floats: np.ndarray, t_us: int, a: Vec3) -> tuple[np.ndarray, np.ndarray]:
-    """One torque over inertia [rad/s^2]: new arrays."""
-    ints, floats = ints.copy(), floats.copy()
+def torque_sample(ints: np.ndarray, floats: np.ndarray, t_us: int, a: Vec3) -> None:
+    """One torque over inertia [rad/s^2], in place."""
     used, stream = gsmo_stream.heard_torque(gsmo_stream.unpack(ints, floats), t_us, a)
     if not used:
         gsmo_stream.tally(ints, gsmo_stream.BAD_TORQUE)
     gsmo_stream.pack(stream, ints, floats)
-    return ints, floats
 
 
 @kernel
@@ -200,14 +193,14 @@ def predict(g: tuple, ints: np.ndarray, floats: np.ndarray, t_us: int) -> tuple[
 
 @kernel
 def predict_online(
-    gyro: Vec3, tick_s: float, ints: np.ndarray, floats: np.ndarray, bank: tuple, t_us: int
+    gyro: Vec3, tick_s: float, ints: np.ndarray, floats: np.ndarray, bank: np.ndarray, t_us: int
 ) -> tuple[Quat, Vec3]:
     """Attitude and rates of the bank at t_us."""
-    stream, now = gsmo_stream.unpack(ints, floats), Bank(*bank)
+    stream, now = gsmo_stream.unpack(ints, floats), gsmo_online.of(bank)
     dt_s = ahead_s(stream, t_us)
     if not dt_s > 0.0:
         return gsmo_online.mixed(now)
-    after = gsmo_online.copy(now)
+    after = gsmo_online.of(bank.copy())
     gap_s = gsmo_stream.GAP_PERIODS * stream.clock.period_s if stream.clock.period_s > 0.0 else math.inf
     gsmo_online.advance(after, gyro, stream.torque.now, dt_s, tick_s, gap_s)
     q, w = gsmo_online.mixed(after)
@@ -241,7 +234,7 @@ def run_online(
     counts: np.ndarray,
 ) -> None:
     """The bank over a record, likewise."""
-    stream, bank = gsmo_stream.init(), gsmo_online.new((1.0, 0.0, 0.0, 0.0))
+    stream, bank = gsmo_stream.init(), gsmo_online.of(gsmo_online.new((1.0, 0.0, 0.0, 0.0)))
     for k in range(len(t_us)):
         q = (q_wxyz[k, 0], q_wxyz[k, 1], q_wxyz[k, 2], q_wxyz[k, 3])
         stream = on_attitude_online(gyro, tick_s, stream, bank, counts, t_us[k], q)

@@ -28,7 +28,7 @@ HANDICAP = tuple([0.0] * WHITE + [math.log(1.3)] * COLOURED + [0.0] * THIRD)
 
 
 class Bank(NamedTuple):
-    """All members, as arrays that the kernels change in place: `copy` it first where the old one is still wanted."""
+    """All members, as arrays that the kernels change in place: views (`of`) of a flat one, which is copied where the old one is still wanted."""
 
     x: np.ndarray  # (MEMBERS,STATES): gsmo_members has the columns
     p: np.ndarray  # (LINEAR,COVARIANCES)
@@ -38,23 +38,31 @@ class Bank(NamedTuple):
     best: np.ndarray  # (3,): forgotten number of judged samples, the best member, variance of the samples' noise [rad^2]
 
 
+_P = MEMBERS * members.STATES
+_V = _P + LINEAR * members.COVARIANCES
+_WEIGHT, _SCALE = _V + 3 * MEMBERS, _V + 6 * MEMBERS
+SIZE = _SCALE + 6
+
+
 @kernel
-def new(q: Quat) -> Bank:
-    bank = Bank(
-        np.zeros((MEMBERS, members.STATES)),
-        np.zeros((LINEAR, members.COVARIANCES)),
-        np.zeros((MEMBERS, 3)),
-        np.zeros((MEMBERS, 3)),
-        np.zeros(3),
-        np.zeros(3),
+def of(flat: np.ndarray) -> Bank:
+    """The bank that lies in a flat array (SIZE,), as views."""
+    return Bank(
+        flat[:_P].reshape((MEMBERS, members.STATES)),
+        flat[_P:_V].reshape((LINEAR, members.COVARIANCES)),
+        flat[_V:_WEIGHT].reshape((MEMBERS, 3)),
+        flat[_WEIGHT:_SCALE].reshape((MEMBERS, 3)),
+        flat[_SCALE : _SCALE + 3],
+        flat[_SCALE + 3 : SIZE],
     )
-    start(bank, q)
-    return bank
 
 
 @kernel
-def copy(bank: Bank) -> Bank:
-    return Bank(bank.x.copy(), bank.p.copy(), bank.v.copy(), bank.weight.copy(), bank.scale.copy(), bank.best.copy())
+def new(q: Quat) -> np.ndarray:
+    """A flat array with a bank at its first sample."""
+    flat = np.zeros(SIZE)
+    start(of(flat), q)
+    return flat
 
 
 @kernel

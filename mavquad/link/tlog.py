@@ -48,8 +48,14 @@ class Writer:
 
     def write_all(self, records: list[tuple[int, bytes]]) -> None:
         """Many frames in one write: those of a datagram, or of a moment. Raises LogError as `write`."""
-        if records:
-            self._put(records[-1][0], b"".join([t_us.to_bytes(STAMP, "big") + raw for t_us, raw in records]))
+        parts: list[bytes] = []
+        last_us, stamp = -1, b""
+        for t_us, raw in records:
+            if t_us != last_us:
+                last_us, stamp = t_us, t_us.to_bytes(STAMP, "big")
+            parts += (stamp, raw)
+        if parts:
+            self._put(last_us, b"".join(parts))
 
     def _put(self, t_us: int, record: bytes) -> None:
         try:

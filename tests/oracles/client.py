@@ -41,6 +41,7 @@ class Client:
         for data in self.sim.collect(self.link):
             for _, m in wire.parse(data):
                 self._take(m)
+        self.sim.record_period()
 
     def _take(self, m):
         name = type(m).__name__

@@ -36,9 +36,9 @@ def test_a_step_leaves_the_state_it_was_given_as_it_was():
 
     state = gsmo.init(ONLINE)
     for k in range(20):
-        kept = [a.copy() for a in (state.ints, state.floats, *state.bank)]
+        kept = [a.copy() for a in (state.ints, state.floats, state.bank)]
         after_it = gsmo.observe(ONLINE, state, Attitude(10_000 * k, quat.exp((0.01 * k, 0.0, 0.0)), ZERO3))
-        for a, b in zip(kept, (state.ints, state.floats, *state.bank), strict=True):
+        for a, b in zip(kept, (state.ints, state.floats, state.bank), strict=True):
             np.testing.assert_array_equal(a, b)
         state = after_it
 
@@ -99,7 +99,7 @@ def test_the_first_second_under_noise_is_flagged_and_half_as_bad():
 def test_the_noise_is_told_from_the_stream_itself(noise_deg):
     source = setup.truth()
     q = setup.noisy(source.q, noise_deg, np.random.default_rng(4))[::2]
-    bank = gsmo_online.new(tuple(q[0]))
+    bank = gsmo_online.of(gsmo_online.new(tuple(q[0])))
     gsmo_online.start(bank, tuple(q[0]))
     for k in range(1, len(q)):
         gsmo_online.advance(bank, ZERO, ZERO, 0.02, 0.01, 1.0)
@@ -109,7 +109,7 @@ def test_the_noise_is_told_from_the_stream_itself(noise_deg):
 
 
 def test_a_member_that_is_lost_goes_on_from_the_best():
-    bank = gsmo_online.new(IDENTITY)
+    bank = gsmo_online.of(gsmo_online.new(IDENTITY))
     gsmo_online.start(bank, IDENTITY)
     for k in range(1, 30):
         gsmo_online.advance(bank, ZERO, ZERO, 0.01, 0.01, 1.0)

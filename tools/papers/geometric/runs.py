@@ -114,7 +114,7 @@ def online(gyro, stimulus, q0, w0):
     a_half, has, samples, h, _ = stimulus
     n = len(has)
     w_out, q_out = np.empty((n, 3)), np.empty((n, 4))
-    bank = gsmo_online.new(_quat(samples, 0))
+    bank = gsmo_online.of(gsmo_online.new(_quat(samples, 0)))
     fresh, since, period = 0, 0.0, 0.0
     for k in range(n):
         if has[k]:
