@@ -1,10 +1,11 @@
 # make fly: install, fly the default scenario, say where the report lies.  make test: install, lint, contracts, tests.
 PYTHON ?= python3
 BIN := .venv/bin
+CLIENTS := .venv-clients
 STAMP := .venv/.installed
 SCENARIO ?= circle
 
-.PHONY: fly test test-page install lint clean
+.PHONY: fly test test-page install test-clients lint clean
 
 fly: install
 	@$(BIN)/mavquad fly $(SCENARIO)
@@ -31,5 +32,17 @@ test: lint
 test-page: install  # the report in a real browser: Debian's package chromium
 	$(BIN)/python -m pytest tests/tools/test_report.py -m slow
 
+test-clients: install $(CLIENTS)/.installed  # MAVSDK, MAVProxy, pymavlink's tools and node-mavlink against the simulated autopilot
+	$(BIN)/python -m pytest tests/clients -m slow
+
+$(CLIENTS)/.installed: requirements-clients.txt tests/clients/programs/package-lock.json
+	@echo "installing other people's clients into $(CLIENTS) (once)"
+	@test -x $(CLIENTS)/bin/python || $(PYTHON) -m venv $(CLIENTS)
+	@$(CLIENTS)/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements-clients.txt
+	@mkdir -p $(CLIENTS)/node && cp tests/clients/programs/package*.json $(CLIENTS)/node
+	@if command -v npm > /dev/null; then cd $(CLIENTS)/node && npm ci --silent --ignore-scripts --no-audit --no-fund; \
+	 else echo "no npm: node-mavlink is left out"; fi
+	@touch $@
+
 clean:
-	rm -rf .venv build *.egg-info
+	rm -rf .venv $(CLIENTS) build *.egg-info

@@ -13,7 +13,7 @@ from typing import Any
 
 from mavquad.airframe import Airframe
 from sitl import autopilot, rotation
-from sitl.autopilot import ACCEPTED, CRITICAL, DENIED, FAILED, INFO, WARNING, Autopilot, Home
+from sitl.autopilot import ACCEPTED, CRITICAL, DENIED, FAILED, INFO, WARNING, Autopilot
 from sitl.state import ATTITUDE, CLIMB, POSITION, RATES
 
 STABILIZE, ALT_HOLD, GUIDED, LOITER, RTL, LAND, POSHOLD, BRAKE, GUIDED_NOGPS = 0, 2, 4, 5, 6, 9, 16, 17, 20
@@ -95,6 +95,7 @@ class ArduPilot(Autopilot):
     rate_limit_hz = 200.0
     rate_denied = DENIED
     refusal = FAILED
+    denied = "Arm"
     timesync_us = 5_000_000
 
     def __init__(self, *args: Any) -> None:
@@ -192,8 +193,7 @@ class ArduPilot(Autopilot):
 
     def mode_tick(self) -> None:
         if self.home is None and self.has_origin:
-            p = self.position()
-            self.home = Home((p[0], p[1], p[2]), tuple(self.vehicle.state["ahrs_q_wxyz"].tolist()))
+            self.set_home()
             self.say(INFO, "EKF3 IMU0 origin set")
         station = int(self.params["SYSID_MYGCS"])
         gone = self.t_us - self.heard_us.get(station, self.t_us) > _STATION_GONE_US

@@ -26,7 +26,7 @@ FORCE = 21196.0  # param2 of an arm command that means it
 
 
 class Home(NamedTuple):
-    """Where the vehicle was armed, local frame."""
+    """Where the vehicle was armed, or first knew where it is; local frame."""
 
     p_ned_m: tuple[float, float, float]
     q_wxyz: tuple[float, ...]
@@ -41,6 +41,7 @@ class Autopilot(ABC):
     rate_limit_hz = 1000.0  # more is refused
     rate_denied = FAILED  # a rate for a message that is not there
     refusal = TEMPORARILY_REJECTED  # of arming and disarming
+    denied = "Arming denied"  # how a reason begins
     timesync_us = 0  # how often it asks for the time unless in lockstep; 0 never
 
     def __init__(self, vehicle: Vehicle, params: Table, say: Callable[[int, str], None]) -> None:
@@ -148,11 +149,10 @@ class Autopilot(ABC):
             return ACCEPTED
         reason = "" if force else self.can_arm()
         if reason:
-            self.say(CRITICAL, f"Arming denied: {reason}")
+            self.say(CRITICAL, f"{self.denied}: {reason}")
             return self.refusal
         self.armed, self.flown, self._armed_us = True, False, self.t_us
-        p = self.position()
-        self.home = Home((p[0], p[1], p[2]), tuple(self.vehicle.state["ahrs_q_wxyz"].tolist()))
+        self.set_home()
         self.vehicle.setpoint["kind"] = IDLE
         self.say(INFO, "Armed by external command")
         return ACCEPTED
@@ -202,6 +202,11 @@ class Autopilot(ABC):
     def yaw(self) -> float:
         """Its heading."""
         return float(self.vehicle.state["ahrs_euler_rad"][2])
+
+    def set_home(self) -> None:
+        """Home is here."""
+        p = self.position()
+        self.home = Home((p[0], p[1], p[2]), tuple(self.vehicle.state["ahrs_q_wxyz"].tolist()))
 
     def boot_ms(self) -> int:
         """Milliseconds since boot."""

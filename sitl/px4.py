@@ -204,6 +204,8 @@ class Px4(Autopilot):
         return result
 
     def mode_tick(self) -> None:
+        if self.home is None and self.t_us - self.boot_us >= _BOOT_US:
+            self.set_home()
         lost_after_us = max(1e6 * self.params["COM_OF_LOSS_T"], 2.0 * autopilot.TICK_US)
         if self.mode[0] != OFFBOARD or self.t_us - self.setpoint_us <= lost_after_us:
             return

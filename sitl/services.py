@@ -1,6 +1,6 @@
-"""What the autopilot does with what it is sent: commands and their ACKs, setpoints, parameters, time, an empty mission.
+"""What the autopilot does with what it is sent: commands and their ACKs, setpoints, parameters, time.
 
-Every command is acknowledged, unknown ones too. What is not understood is left alone in silence, as a real autopilot does.
+Every command is acknowledged, unknown ones too; what else is asked for and not there is refused in `refusals`.
 """
 
 import math
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from mavquad import wire
 from mavquad.wire import Frame
-from sitl import telemetry
+from sitl import refusals, telemetry
 from sitl.autopilot import ACCEPTED, DENIED, FORCE, NOTICE, UNSUPPORTED
 from sitl.links import Link
 
@@ -39,11 +39,8 @@ class Services:
             "PARAM_REQUEST_LIST": self._param_list,
             "PARAM_REQUEST_READ": self._param_read,
             "PARAM_SET": self._param_set,
-            "MISSION_REQUEST_LIST": self._mission_list,
-            "MISSION_COUNT": self._mission_refused,
-            "MISSION_CLEAR_ALL": self._mission_cleared,
-            "FILE_TRANSFER_PROTOCOL": self._ftp,
             "REQUEST_DATA_STREAM": self._data_stream,
+            **refusals.handlers(sim),
         }
         self.handlers = {wire.ID[name]: handler for name, handler in by_name.items()}
         self._commands: dict[int, Callable[[Link, Frame, list[float]], int]] = {
@@ -165,34 +162,20 @@ class Services:
 
     def _param_read(self, link: Link, frame: Frame, m: Any) -> None:
         name = self._sim.autopilot.params.find(m.param_id, m.param_index)
-        if name is not None:
+        if name is None:
+            self._sim.send(link, *refusals.unknown_parameter(frame, m))
+        else:
             self._sim.send(link, "PARAM_VALUE", self._sim.autopilot.params.fields(name))
 
     def _param_set(self, link: Link, frame: Frame, m: Any) -> None:
         autopilot = self._sim.autopilot
         if m.param_id not in autopilot.params:
+            self._sim.send(link, *refusals.unknown_parameter(frame, m))
             return
         if autopilot.params.put_wire(m.param_id, m.param_value, m.param_type):
             autopilot.apply_params()
         for peer in self._sim.links:  # everybody learns of a change
             self._sim.send(peer, "PARAM_VALUE", autopilot.params.fields(m.param_id))
-
-    # ---- mission and files: none --------------------------------------------------------------------------------------
-    def _mission_list(self, link: Link, frame: Frame, m: Any) -> None:
-        self._sim.send(link, "MISSION_COUNT", (frame.system, frame.component, 0, m.mission_type))
-
-    def _mission_refused(self, link: Link, frame: Frame, m: Any) -> None:
-        kind = 0 if m.count == 0 else 3  # MAV_MISSION_ACCEPTED, MAV_MISSION_UNSUPPORTED
-        self._sim.send(link, "MISSION_ACK", (frame.system, frame.component, kind, m.mission_type))
-
-    def _mission_cleared(self, link: Link, frame: Frame, m: Any) -> None:
-        self._sim.send(link, "MISSION_ACK", (frame.system, frame.component, 0, m.mission_type))
-
-    def _ftp(self, link: Link, frame: Frame, m: Any) -> None:
-        sequence = (m.payload[0] | m.payload[1] << 8) + 1 & 0xFFFF
-        # session 0, opcode NAK (129), one byte of data: UnknownCommand (7), in answer to the opcode that came
-        answer = (sequence & 0xFF, sequence >> 8, m.payload[2], 129, 1, m.payload[3], 0, 0, 0, 0, 0, 0, 7)
-        self._sim.send(link, "FILE_TRANSFER_PROTOCOL", (0, frame.system, frame.component, answer + (0,) * (251 - len(answer))))
 
 
 def _number(x: float) -> int:

@@ -23,6 +23,7 @@ COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 _HEARTBEAT, _TIMESYNC = wire.ID["HEARTBEAT"], wire.ID["TIMESYNC"]
 TRUTH_COMPONENT = 25  # MAV_COMP_ID_USER1: truth has a sequence of its own
 _BOOT_SILENCE_US = 1_500_000
+_TEXT = 50  # characters of a STATUSTEXT
 Record = Callable[[list[tuple[int, bytes]]], None]
 
 
@@ -57,7 +58,7 @@ class Simulation:
         self._was_engaged = False
         self._barrier_ns = -1
         self._first_heartbeat: bytes | None = None
-        self._truth_seq = 0
+        self._truth_seq = self._texts = 0
 
     @property
     def t_us(self) -> int:
@@ -112,9 +113,14 @@ class Simulation:
             link.down.put(self.t_us, (name, fields))
 
     def say(self, severity: int, text: str) -> None:
-        """STATUSTEXT to every peer, cut at MAVLink's 50 characters."""
+        """STATUSTEXT to every peer, in numbered parts where it is longer than MAVLink's 50 characters."""
+        parts, number = [text], 0
+        if len(text) > _TEXT:
+            parts = [text[i : i + _TEXT] for i in range(0, len(text) + 1, _TEXT)]  # a part that is not full ends it
+            self._texts = number = self._texts % 0xFFFF + 1
         for link in self.links:
-            self.send(link, "STATUSTEXT", (severity, text[:50], 0, 0))
+            for i, part in enumerate(parts):
+                self.send(link, "STATUSTEXT", (severity, part, number, i))
 
     # ---- time ---------------------------------------------------------------------------------------------------------
     @property

@@ -19,7 +19,8 @@ Fields = tuple[Any, ...]
 NAN = math.nan
 _ZEROS_12 = (0,) * 12
 # gyro, accelerometer, magnetometer, pressure, GPS, rate, attitude, yaw, z, xy control, motors, AHRS, battery, pre-arm check
-_SENSORS = 1 | 2 | 4 | 8 | 32 | 1024 | 2048 | 4096 | 8192 | 16384 | 32768 | 1 << 21 | 1 << 25 | 1 << 28
+_GEOFENCE, _PRE_ARM = 1 << 20, 1 << 28
+_SENSORS = 1 | 2 | 4 | 8 | 32 | 1024 | 2048 | 4096 | 8192 | 16384 | 32768 | 1 << 21 | 1 << 25 | _PRE_ARM
 _HEALTH = {"gyro": 1, "accel": 2, "attitude": 1 << 21, "position": 32}
 _FULL_MV, _EMPTY_MV = 16_800, 13_200
 
@@ -115,7 +116,10 @@ def builders(sim: "Simulation") -> dict[str, Callable[[], Fields | None]]:
         return boot_us(), 3, lat, lon, height, 80, 120, speed, course, 14, height, 300, 400, 50, 0, 0
 
     def sys_status() -> Fields:
-        health = _SENSORS & ~sum({_HEALTH[s] for s in sim.faults.sick if s in _HEALTH})
+        sick = sum({_HEALTH[s] for s in sim.faults.sick if s in _HEALTH})
+        health = _SENSORS & ~sick | _GEOFENCE  # there is no fence, so none is broken
+        if not sim.autopilot.armed and sim.autopilot.can_arm():
+            health &= ~_PRE_ARM
         left = sim.battery()
         volts = round(_EMPTY_MV + (_FULL_MV - _EMPTY_MV) * left)
         return _SENSORS, _SENSORS, health, 250, volts, 1500, round(100 * left), 0, 0, 0, 0, 0, 0, 0, 0, 0

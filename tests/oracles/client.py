@@ -49,7 +49,10 @@ class Client:
         self.on(m)
         self.last[name] = m
         if name == "STATUSTEXT":
-            self.texts.append(m.text)
+            if m.id and m.chunk_seq:
+                self.texts[-1] += m.text
+            else:
+                self.texts.append(m.text)
         elif name == "COMMAND_ACK":
             self.acks[m.command] = m.result
         elif name == "LOCAL_POSITION_NED":
