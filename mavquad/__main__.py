@@ -16,6 +16,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="udpin:, udpout:, tcp:HOST:PORT or serial:DEVICE:BAUD (default: %(default)s)",
     )
     parser.add_argument("--config", type=Path, help="a companion.toml; without one: the defaults, hovering where it is")
+    parser.add_argument(
+        "--forward",
+        action="append",
+        default=[],
+        metavar="ENDPOINT",
+        help="a ground station or monitor on a link of its own, e.g. udpout:127.0.0.1:14550 (may be repeated)",
+    )
     parser.add_argument("--run", type=Path, help="folder for the logs (default: runs/<time>-companion)")
     parser.add_argument("--engage", action="store_true", help="take off and fly the path as soon as the autopilot is ready")
     parser.add_argument(
@@ -29,14 +36,18 @@ def run(args: argparse.Namespace) -> int:
     from mavquad.link.endpoint import open_endpoint
 
     endpoint = open_endpoint(args.endpoint)  # first: what is wrong with it is known before anything is compiled
+    further = [(open_endpoint(name), name) for name in args.forward]
     from mavquad import config, pipeline, plan_file, settings, warm
     from mavquad.companion import Companion
+    from mavquad.relay import Relay
 
     chosen = config.load(args.config, settings.Companion) if args.config else settings.Companion()
     plan = pipeline.build(chosen)
     folder = args.run or Path("runs") / f"{clock.stamp()}-companion"
     warm.run(plan)  # compile or load before anybody waits for an answer
-    companion = Companion(plan, endpoint, folder, lockstep=args.lockstep, engage=args.engage)
+    companion = Companion(
+        plan, endpoint, folder, lockstep=args.lockstep, engage=args.engage, relays=tuple(Relay(*link) for link in further)
+    )
     try:
         plan_file.write(plan_file.beside(companion.log.path), plan.settings, plan.airframe)
         companion.run()

@@ -17,17 +17,19 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from mavquad import lifecycle, pipeline, wire
+from mavquad import lifecycle, pipeline, relay, wire
 from mavquad.errors import FlightError
 from mavquad.link import clock, health
 from mavquad.link.endpoint import Address, Endpoint
 from mavquad.link.tlog import Writer
 from mavquad.pipeline import Flight, Plan
+from mavquad.relay import Relay
 from mavquad.wire import Frame
 
 _MAX_DATAGRAM = 1400
 _LOCKSTEP_WAIT_S = 10.0
 _SILENCE_S = 5.0
+_RELAY_S = 0.02  # a further link waits no longer for us, however silent the autopilot is
 _MOVED_S = 3.0  # an autopilot silent for so long may come back from another address
 _TIMESYNC = wire.ID["TIMESYNC"]
 _SETPOINTS = frozenset((wire.ID["SET_ATTITUDE_TARGET"], wire.ID["SET_POSITION_TARGET_LOCAL_NED"]))
@@ -66,12 +68,21 @@ def next_log(run: Path, stem: str) -> Path:
 
 
 class Companion:
-    """One companion on one endpoint."""
+    """One companion on the autopilot's endpoint, with further links (`relay`) beside it."""
 
-    def __init__(self, plan: Plan, endpoint: Endpoint, run: Path, lockstep: bool = False, engage: bool = False) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        endpoint: Endpoint,
+        run: Path,
+        lockstep: bool = False,
+        engage: bool = False,
+        relays: tuple[Relay, ...] = (),
+    ) -> None:
         run.mkdir(parents=True, exist_ok=True)
         self.plan = plan
         self.endpoint = endpoint
+        self.relays = relays
         self.lockstep = lockstep
         self.flight: Flight = pipeline.start(plan)
         path = next_log(run, "flight")
@@ -94,6 +105,7 @@ class Companion:
         self.setpoints = 0
         self.received = 0
         self._said_silent = False
+        self._said_broken: set[str] = set()
 
     # ---- one frame ----------------------------------------------------------------------------------------------
     def _refuse(self, frame: Frame, stamp_us: int, reason: str) -> None:
@@ -166,12 +178,31 @@ class Companion:
         size = 0
         for raw in parts:
             if size + len(raw) > _MAX_DATAGRAM:
-                self.endpoint.send(b"".join(chunk))
+                self._out(b"".join(chunk))
                 chunk, size = [], 0
             chunk.append(raw)
             size += len(raw)
         if chunk:
-            self.endpoint.send(b"".join(chunk))
+            self._out(b"".join(chunk))
+
+    def _out(self, data: bytes) -> None:
+        self.endpoint.send(data)
+        for link in self.relays:
+            link.copy(data)
+
+    def _listen_to_relays(self) -> None:
+        """What ground stations and monitors say: on to the autopilot, and to us like everything that arrives."""
+        own = (self.plan.settings.link.system, self.plan.settings.link.component)
+        for link in self.relays:
+            for frames, address in link.heard():
+                target = self.flight.life.target
+                on = [frame.raw for frame in frames if relay.passes(frame, own, target, wire.addressee(frame))]
+                if on:
+                    self.endpoint.send(b"".join(on))
+                self.take(frames, address, self._stamp_us)
+            if link.broken and link.name not in self._said_broken:
+                self._said_broken.add(link.name)
+                print(f"--forward {link.name}: {link.broken}; flying on without it", file=sys.stderr, flush=True)
 
     def _want_engage(self, stamp_us: int) -> None:
         if self._engage and self.flight.life.state == lifecycle.OBSERVING:
@@ -200,9 +231,13 @@ class Companion:
             if self._refused is not None:
                 self._refused.close()
             self.endpoint.close()
+            for link in self.relays:
+                link.close()
 
     def _frames(self, data: bytes, address: Address) -> list[Frame]:
         """Frames of a datagram, or of a piece of a byte stream."""
+        for link in self.relays:
+            link.copy(data)
         frames, junk, rest = wire.split(self._rest.pop(address, b"") + data)
         if rest and not hasattr(self.endpoint, "peers"):
             self._rest[address] = rest
@@ -236,6 +271,7 @@ class Companion:
                 if self._stamp_us >= self.flight.due_us:
                     self._emit(pipeline.advance(self.plan, self.flight, self._stamp_us))
                 self._want_engage(self._stamp_us)
+                self._listen_to_relays()
                 self._flush()
             if self._stop and not arrived:
                 return
@@ -244,7 +280,7 @@ class Companion:
     def _wait_s(self, now_us: int) -> float:
         if not self.flight.heartbeat_us:
             return 0.2
-        return min(0.2, max(0.0, 1e-6 * (self.flight.due_us - now_us)))
+        return min(_RELAY_S if self.relays else 0.2, max(0.0, 1e-6 * (self.flight.due_us - now_us)))
 
     def _complain(self, silent_s: float) -> None:
         if silent_s > _SILENCE_S and not self._said_silent:
@@ -296,6 +332,7 @@ class Companion:
         before = self.setpoints
         frames, self._waiting = self._waiting, []
         self.take(frames[:-1], address, self._stamp_us)
+        self._listen_to_relays()
         self._want_engage(self._stamp_us)
         self.take(frames[-1:], address, self._stamp_us)  # its answer ends the period
         self._flush()

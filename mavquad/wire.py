@@ -49,7 +49,7 @@ def _cut(value: bytes) -> str:
 class Spec:
     """How one message is laid out; `make(*fields)` is its NamedTuple."""
 
-    __slots__ = ("_extra", "_id", "_pack", "_unpack", "crc_extra", "length", "make", "msgid", "name", "struct")
+    __slots__ = ("_extra", "_id", "_pack", "_unpack", "addressed", "crc_extra", "length", "make", "msgid", "name", "struct")
 
     def __init__(self, cls: Any) -> None:
         self.msgid: int = cls.id
@@ -60,6 +60,7 @@ class Spec:
         self.length = self.struct.size
         make: Any = namedtuple(cls.msgname, cls.fieldnames)  # type: ignore[misc]
         self.make = make
+        self.addressed = "target_system" in cls.fieldnames
         wire_names = list(cls.ordered_fieldnames)
         self._id = (cls.id & 0xFFFF, cls.id >> 16)
         kinds = dict(zip(cls.fieldnames, cls.fieldtypes, strict=True))
@@ -177,6 +178,14 @@ def decode(frame: Frame) -> Any:
         raise WireError(f"message id {frame.msgid} from {frame.system}/{frame.component} is in no known dialect") from None
     raw = frame.raw
     return s.unpack(raw[10 : 10 + raw[1]] if raw[0] == STX_V2 else raw[6 : 6 + raw[1]])
+
+
+def addressee(frame: Frame) -> tuple[int, int]:
+    """(system, component) a frame is addressed to; 0 for all, and for a message that has no such fields or is not known."""
+    if frame.msgid not in ID_SET or not SPECS[frame.msgid].addressed:
+        return 0, 0
+    message = decode(frame)
+    return getattr(message, "target_system", 0), getattr(message, "target_component", 0)
 
 
 def parse(data: bytes) -> Iterator[tuple[Frame, Any]]:
