@@ -218,6 +218,8 @@ class Companion:
         """Until stopped by a signal or `stop()`. The log is whole at every moment."""
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self.stop)
+        for words in self.plan.warnings:
+            print(f"warning: {words}", file=sys.stderr, flush=True)
         gc.freeze()  # what is loaded by now stays: a collection need not walk through it, which takes a tenth of a second
         try:
             if self.lockstep:
@@ -350,6 +352,7 @@ class Companion:
         return {
             "state": life.state,
             "reason": life.reason,
+            "warnings": list(self.plan.warnings),
             "states": [{"t_s": round(t, 3), "state": s, "reason": r} for t, s, r in self.states],
             "setpoints_sent": self.setpoints,
             "messages_received": self.received,

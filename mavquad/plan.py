@@ -6,8 +6,8 @@ from dataclasses import fields as dataclass_fields
 from types import ModuleType
 from typing import Any, NamedTuple
 
+from mavquad import adrc_checks, paths, publish, wire
 from mavquad import airframe as airframes
-from mavquad import paths, publish, wire
 from mavquad.airframe import Airframe
 from mavquad.config import value as toml_value
 from mavquad.errors import ConfigError
@@ -56,6 +56,7 @@ class Plan(NamedTuple):
     control_us: int
     samples: dict[int, str]  # messages whose samples some stage uses, by id
     trace_names: tuple[str, ...]
+    warnings: tuple[str, ...]  # of the checks at design time: what will fly, but not well
 
 
 def stage(kind: str, spec: str, table: dict[str, str], tune: dict[str, dict[str, Any]], airframe: Airframe) -> Stage:
@@ -128,7 +129,20 @@ def build(settings: Companion, airframe: Airframe | None = None) -> Plan:
         round(1e6 / settings.control_hz),
         _samples((estimator_stage, controller_stage, compensator, *observers)),
         publish.trace_names(tuple(s.label for s in observers), compensator.module if compensator else None),
+        tuple(adrc_checks.enforce(_checks(estimator_stage, controller_stage))),
     )
+
+
+def _checks(estimator: Stage, controller: Stage) -> list[adrc_checks.Finding]:
+    """What can be said before the flight of an extended state observer, and of it beside the law that it serves."""
+    found = list(estimator.module.checks(estimator.params)) if hasattr(estimator.module, "checks") else []
+    wc = getattr(controller.gains, "wc", None)
+    if wc is not None:
+        for label, i in (("xy", 0), ("z", 2)):
+            w0 = getattr(estimator.params, f"w0_{label}_rad_s", None)
+            if w0 is not None:
+                found.append(adrc_checks.separation(f"{controller.label}: w0/wc {label}", wc[i], w0))
+    return found
 
 
 def _with_loop(settings: Companion, module: str) -> dict[str, dict[str, Any]]:

@@ -137,7 +137,6 @@ def gains(params: Params, airframe: Airframe) -> Gains:
         ),
         model,
     )
-    adrc_checks.enforce(checks(params))
     lag_s = params.thrust_lag_s if params.thrust_lag_s >= 0.0 else (airframe.rotors.lag_s if airframe.rotors else 0.0)
     return Gains(
         filter_gains,

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mavquad import airframe, quat
+from mavquad import airframe, config, plan, quat
 from mavquad.control import adrc_flight, iadrc_flight, lagged, pid
 from mavquad.errors import ConfigError
 from mavquad.estimate import applied_thrust, direct, joint_flight, leso_flight
+from mavquad.settings import Companion
 from mavquad.signals import NAN3, ZERO3, Applied, Attitude, Demand, Estimate, Imu, Position, Target
 from tests.oracles.outer_flight import World, fly
 
@@ -197,6 +198,19 @@ def test_a_filter_too_slow_for_its_observers_is_warned_of():
     ]
     assert verdicts[0] == "warn"
     assert {f.verdict for f in joint_flight.checks(joint_flight.Params())} == {"ok"}
+
+
+def planned(**settings):
+    return plan.build(config.convert({"controller": "iadrc", **settings}, Companion, "test"), X500)
+
+
+def test_what_the_design_checks_warn_of_is_in_the_plan_and_what_they_refuse_is_not_built():
+    assert [w for w in planned().warnings if "below 3 wc" in w]
+    assert planned(tune={"iadrc": {"wc_xy_rad_s": 2.5, "wc_z_rad_s": 2.5}}).warnings == ()
+    with pytest.raises(
+        ConfigError, match=r"iadrc: w0/wc xy: 1\.33, limit 1\.5: w0 8 is below 1\.5 wc \(6\); raise w0 or lower wc"
+    ):
+        planned(tune={"iadrc": {"wc_xy_rad_s": 6.0}})
 
 
 # ---- the controller alone --------------------------------------------------------------------------------------------
