@@ -5,7 +5,7 @@ CLIENTS := .venv-clients
 STAMP := .venv/.installed
 SCENARIO ?= circle
 
-.PHONY: fly test test-page install test-clients lint clean
+.PHONY: fly test test-page long install test-clients lint clean
 
 fly: install
 	@$(BIN)/mavquad fly $(SCENARIO)
@@ -31,6 +31,9 @@ test: lint
 
 test-page: install  # the report in a real browser: Debian's package chromium
 	$(BIN)/python -m pytest tests/tools/test_report.py -m slow
+
+long: install  # eighty minutes of vehicle time in lockstep: flat memory, no miss
+	$(BIN)/python -m pytest -s tests/loop/test_long_flight.py -m slow
 
 test-clients: install $(CLIENTS)/.installed  # MAVSDK, MAVProxy, pymavlink's tools and node-mavlink against the simulated autopilot
 	$(BIN)/python -m pytest tests/clients -m slow

@@ -13,6 +13,7 @@ import os
 import signal
 import struct
 import sys
+from collections import deque
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -29,6 +30,7 @@ from mavquad.wire import Frame
 _MAX_DATAGRAM = 1400
 _LOCKSTEP_WAIT_S = 10.0
 _SILENCE_S = 5.0
+_LATENCIES = 1 << 16  # the last ones, for the summary: memory stays flat however long the flight
 _RELAY_S = 0.02  # a further link waits no longer for us, however silent the autopilot is
 _MOVED_S = 3.0  # an autopilot silent for so long may come back from another address
 _TIMESYNC = wire.ID["TIMESYNC"]
@@ -100,7 +102,7 @@ class Companion:
         self._to_send: list[bytes] = []
         self._waiting: list[Frame] = []  # lockstep: frames of a period whose barrier is still to come
         self.sources: dict[tuple[int, int], health.Source] = {}
-        self.latency_us: list[float] = []
+        self.latency_us: deque[float] = deque(maxlen=_LATENCIES)
         self.states: list[tuple[float, str, str]] = []
         self.setpoints = 0
         self.received = 0
