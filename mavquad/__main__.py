@@ -26,6 +26,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--run", type=Path, help="folder for the logs (default: runs/<time>-companion)")
     parser.add_argument("--engage", action="store_true", help="take off and fly the path as soon as the autopilot is ready")
     parser.add_argument(
+        "--signing-key", metavar="FILE", help="sign everything, take only what is signed with the key in FILE (mode 0600)"
+    )
+    parser.add_argument(
+        "--signing-state",
+        type=Path,
+        metavar="FILE",
+        help="where timestamps are kept (default: beside the key; in lockstep the run folder)",
+    )
+    parser.add_argument(
         "--lockstep", action="store_true", help="vehicle time waits for us (the simulated autopilot must be started so too)"
     )
 
@@ -39,14 +48,27 @@ def run(args: argparse.Namespace) -> int:
     further = [(open_endpoint(name), name) for name in args.forward]
     from mavquad import config, pipeline, plan_file, settings, warm
     from mavquad.companion import Companion
+    from mavquad.link import signing
     from mavquad.relay import Relay
 
     chosen = config.load(args.config, settings.Companion) if args.config else settings.Companion()
     plan = pipeline.build(chosen)
     folder = args.run or Path("runs") / f"{clock.stamp()}-companion"
+    key = args.signing_key or chosen.link.signing_key
+    signer = None
+    if key:
+        folder.mkdir(parents=True, exist_ok=True)
+        beside = Path(f"{key}.companion-{chosen.link.system}-{chosen.link.component}")
+        signer = signing.open_signer(key, args.signing_state or (folder / "companion.signing" if args.lockstep else beside))
     warm.run(plan)  # compile or load before anybody waits for an answer
     companion = Companion(
-        plan, endpoint, folder, lockstep=args.lockstep, engage=args.engage, relays=tuple(Relay(*link) for link in further)
+        plan,
+        endpoint,
+        folder,
+        lockstep=args.lockstep,
+        engage=args.engage,
+        relays=tuple(Relay(*link) for link in further),
+        signer=signer,
     )
     try:
         plan_file.write(plan_file.beside(companion.log.path), plan.settings, plan.airframe)

@@ -21,7 +21,8 @@ from typing import Any
 from mavquad import lifecycle, pipeline, relay, wire
 from mavquad.errors import FlightError
 from mavquad.link import clock, health
-from mavquad.link.endpoint import Address, Endpoint
+from mavquad.link.endpoint import Address, Endpoint, UdpEndpoint
+from mavquad.link.signing import SETUP_SIGNING, Signer
 from mavquad.link.tlog import Writer
 from mavquad.pipeline import Flight, Plan
 from mavquad.relay import Relay
@@ -80,12 +81,14 @@ class Companion:
         lockstep: bool = False,
         engage: bool = False,
         relays: tuple[Relay, ...] = (),
+        signer: Signer | None = None,
     ) -> None:
         run.mkdir(parents=True, exist_ok=True)
         self.plan = plan
         self.endpoint = endpoint
         self.relays = relays
         self.lockstep = lockstep
+        self.signer = signer
         self.flight: Flight = pipeline.start(plan)
         path = next_log(run, "flight")
         self.log = Writer(path)
@@ -111,21 +114,29 @@ class Companion:
 
     # ---- one frame ----------------------------------------------------------------------------------------------
     def _refuse(self, frame: Frame, stamp_us: int, reason: str) -> None:
-        if self._refused is None:
-            self._refused = Writer(self._refused_path)
-        self._refused.write(stamp_us, frame.raw)
+        if frame.msgid != SETUP_SIGNING:  # a key belongs in no log
+            if self._refused is None:
+                self._refused = Writer(self._refused_path)
+            self._refused.write(stamp_us, frame.raw)
         self.refused[reason] = self.refused.get(reason, 0) + 1
 
     def _accepts(self, frame: Frame, address: Address, stamp_us: int) -> bool:
-        reason = pipeline.accepts(self.plan, self.flight, frame)
+        reason = self.signer.refuses(frame, stamp_us) if self.signer else ""
+        reason = reason or pipeline.accepts(self.plan, self.flight, frame)
         if not reason and (frame.system, frame.component) == self.flight.life.target and address != self._address:
             if self._address is not None and stamp_us - self._address_us < _MOVED_S * 1e6:
                 reason = "our autopilot's id from another address"
             else:
-                self._address = address
+                self._found(address, stamp_us)
         if reason:
             self._refuse(frame, stamp_us, reason)
         return not reason
+
+    def _found(self, address: Address, stamp_us: int) -> None:
+        """Our autopilot is at this address from now on."""
+        self._address, self._address_us = address, stamp_us
+        if isinstance(self.endpoint, UdpEndpoint):
+            self.endpoint.answer(address)
 
     def take(self, frames: list[Frame], address: Address, stamp_us: int) -> None:
         """Log frames that arrived together, act on them, log what they make us say.
@@ -140,7 +151,8 @@ class Companion:
         accepted = []
         for frame in frames:
             key = (frame.system, frame.component)
-            if (key == target and address == self._address) or self._accepts(frame, address, stamp_us):
+            known = key == target and address == self._address and self.signer is None and frame.msgid != SETUP_SIGNING
+            if known or self._accepts(frame, address, stamp_us):
                 accepted.append(frame)
                 sources[key] = health.on_frame(sources.get(key), frame.seq)
         if not accepted:
@@ -150,7 +162,7 @@ class Companion:
         self.received += len(accepted)
         self._act(accepted, stamp_us)
         if self._address is None and self.flight.life.target in sources:
-            self._address, self._address_us = address, stamp_us
+            self._found(address, stamp_us)
 
     def _act(self, frames: list[Frame], stamp_us: int) -> None:
         if stamp_us >= self.flight.due_us:  # timers first: they are logged at their own due time
@@ -162,8 +174,11 @@ class Companion:
         before, self.flight = self.flight, flight
         if flight is before:
             return
-        self.log.write_all(flight.outbox)
-        for _, raw in flight.outbox:
+        out = flight.outbox
+        if self.signer is not None:
+            out = [(stamp_us, self.signer.sign(raw, stamp_us)) for stamp_us, raw in out]
+        self.log.write_all(out)
+        for _, raw in out:
             self._to_send.append(raw)
             self.setpoints += int.from_bytes(raw[7:10], "little") in _SETPOINTS
         for row in flight.trace:
@@ -229,14 +244,20 @@ class Companion:
             else:
                 self._run_live()
         finally:
-            self._flush()
-            self.log.close()
-            self.trace.close()
-            if self._refused is not None:
-                self._refused.close()
-            self.endpoint.close()
-            for link in self.relays:
-                link.close()
+            self.close()
+
+    def close(self) -> None:
+        """Send what is left; close logs, endpoint and signing state."""
+        self._flush()
+        self.log.close()
+        self.trace.close()
+        if self._refused is not None:
+            self._refused.close()
+        self.endpoint.close()
+        for link in self.relays:
+            link.close()
+        if self.signer is not None:
+            self.signer.close()
 
     def _frames(self, data: bytes, address: Address) -> list[Frame]:
         """Frames of a datagram, or of a piece of a byte stream."""
@@ -258,9 +279,7 @@ class Companion:
             now_us = max(self._stamp_us, clock.wall_us())
             if not self.flight.heartbeat_us and now_us - greet_us > 1_000_000:  # nobody yet: say that we are here
                 greet_us = now_us
-                own = self.plan.settings.link
-                hello = (18, lifecycle.INVALID, 0, 0, 4, 3)
-                self.endpoint.send(wire.encode("HEARTBEAT", hello, seq=0, system=own.system, component=own.component))
+                self.endpoint.send(self._hello(now_us))
             arrived = self.endpoint.receive(0.0 if self._stop else self._wait_s(now_us))
             begun = clock.monotonic_s()
             self._stamp_us = max(self._stamp_us, clock.wall_us())
@@ -281,6 +300,13 @@ class Companion:
                 return
             self._complain(begun - max(started, last_heard))
 
+    def _hello(self, now_us: int) -> bytes:
+        """A HEARTBEAT to whoever may be there, before anybody was heard."""
+        own = self.plan.settings.link
+        fields = (18, lifecycle.INVALID, 0, 0, 4, 3)
+        raw = wire.encode("HEARTBEAT", fields, seq=0, system=own.system, component=own.component)
+        return self.signer.sign(raw, now_us) if self.signer else raw
+
     def _wait_s(self, now_us: int) -> float:
         if not self.flight.heartbeat_us:
             return 0.2
@@ -299,8 +325,7 @@ class Companion:
             self._said_silent = False
 
     def _run_lockstep(self) -> None:
-        own = self.plan.settings.link
-        hello = wire.encode("HEARTBEAT", (18, lifecycle.INVALID, 0, 0, 4, 3), seq=0, system=own.system, component=own.component)
+        hello = self._hello(clock.EPOCH_US - 1_000_000)  # one for all: how often it is sent must not show
         heard = clock.monotonic_s()
         greeted = -1.0
         while True:
@@ -320,16 +345,26 @@ class Companion:
                 continue
             heard = begun
             for data, address in arrived:
-                for frame in self._frames(data, address):
+                frames = self._frames(data, address)
+                if self._address not in (None, address):  # somebody else: outside of the periods
+                    self.take(frames, address, self._stamp_us)
+                    continue
+                for frame in frames:
                     self._waiting.append(frame)
                     if frame.msgid == _TIMESYNC and self._is_barrier(frame):
                         self._period(address, begun)
 
     def _is_barrier(self, frame: Frame) -> bool:
+        """Only our autopilot moves time on, and never back."""
         message = wire.decode(frame)
-        if message.tc1 != 0:
+        stamp_us = clock.EPOCH_US + message.ts1 // 1000
+        if message.tc1 != 0 or stamp_us < self._stamp_us:
             return False
-        self._stamp_us = clock.EPOCH_US + message.ts1 // 1000
+        if self.flight.life.target not in ((0, 0), (frame.system, frame.component)):
+            return False
+        if self.signer and self.signer.refuses(frame, stamp_us, new=False):
+            return False
+        self._stamp_us = stamp_us
         return True
 
     def _period(self, address: Address, begun: float) -> None:

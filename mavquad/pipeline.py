@@ -86,6 +86,8 @@ def accepts(plan: Plan, flight: Flight, frame: Frame) -> str:
     own = plan.settings.link
     if (frame.system, frame.component) == (own.system, own.component):
         return "our own address"
+    if frame.msgid == _SETUP_SIGNING:
+        return "a key sent over the link"
     target = flight.life.target
     if target == (0, 0) or (frame.system, frame.component) == target:
         return ""
@@ -94,6 +96,7 @@ def accepts(plan: Plan, flight: Flight, frame: Frame) -> str:
     return "not from our autopilot"
 
 
+_SETUP_SIGNING = wire.ID["SETUP_SIGNING"]
 _FOR_ANYBODY = frozenset(
     wire.ID[name]
     for name in (

@@ -6,6 +6,7 @@ a further link goes to the autopilot as it is, but for what is meant for us alon
 
 from mavquad.errors import LinkError
 from mavquad.link.endpoint import Address, Endpoint
+from mavquad.link.signing import SETUP_SIGNING
 from mavquad.wire import Frame, split
 
 
@@ -47,4 +48,6 @@ class Relay:
 
 def passes(frame: Frame, own: tuple[int, int], autopilot: tuple[int, int], addressee: tuple[int, int]) -> bool:
     """Whether a frame from a further link goes on to the autopilot; addressee: its target system and component, 0 for all."""
+    if frame.msgid == SETUP_SIGNING:  # it carries a key
+        return False
     return (frame.system, frame.component) not in (own, autopilot) and addressee != own

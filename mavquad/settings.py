@@ -30,6 +30,7 @@ class Link(config.Section, frozen=True):
             "SYS_STATUS": 2.0,
         }
     )
+    signing_key: str = ""  # a file with the key of MAVLink 2 signing; empty: nothing is signed
     timesync_hz: float = 5.0
     publish_hz: float = 5.0
 

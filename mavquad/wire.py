@@ -8,6 +8,7 @@ Source: MAVLink serialisation and signing, https://mavlink.io/en/guide/serializa
 """
 
 import hashlib
+import hmac
 import struct
 from collections import namedtuple
 from collections.abc import Iterator
@@ -204,7 +205,16 @@ def sign(raw: bytes, key: bytes, link_id: int, timestamp_10us: int) -> bytes:
     return checked + tail + hashlib.sha256(key + checked + tail).digest()[:6]
 
 
+def unsigned(raw: bytes) -> bytes:
+    """A MAVLink 2 frame without its signature: as it was before `sign`. An unsigned one is returned as it is."""
+    if raw[0] != STX_V2 or not raw[2] & SIGNED:
+        return raw
+    head = raw[:2] + bytes([raw[2] & ~SIGNED]) + raw[3 : -2 - SIGNATURE_LENGTH]
+    return head + mcrf4xx(head[1:] + SPECS[int.from_bytes(raw[7:10], "little")]._extra).to_bytes(2, "little")
+
+
 def is_signed(frame: Frame) -> bool:
+    """Whether it carries a signature, right or wrong."""
     return frame.raw[0] == STX_V2 and bool(frame.raw[2] & SIGNED)
 
 
@@ -213,6 +223,6 @@ def verify(frame: Frame, key: bytes) -> tuple[int, int] | None:
     if not is_signed(frame):
         return None
     body, signature = frame.raw[:-6], frame.raw[-6:]
-    if hashlib.sha256(key + body).digest()[:6] != signature:
+    if not hmac.compare_digest(hashlib.sha256(key + body).digest()[:6], signature):
         return None
     return body[-7], int.from_bytes(body[-6:], "little")

@@ -31,6 +31,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--forward", action="append", default=[], metavar="E", help="udpout:HOST:PORT: a copy of both directions"
     )
+    parser.add_argument("--signing-key", metavar="FILE", help="sign everything, take only what is signed with the key in FILE")
+    parser.add_argument(
+        "--signing-state", type=Path, metavar="FILE", help="where timestamps are kept (default: beside the log, or the key)"
+    )
     parser.add_argument("--log", type=Path, metavar="FILE", help="tlog of every frame, with the truth")
     pace = parser.add_mutually_exclusive_group()
     pace.add_argument("--lockstep", action="store_true", help="vehicle time waits for a companion's answers")
@@ -41,13 +45,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fly until told to stop. Raises MavquadError."""
+    from mavquad.link import signing
     from sitl import config, shell  # numpy and the kernels: not for --help
 
     if not args.speed > 0.0:
         raise ConfigError(f"--speed {args.speed}: expected more than 0 (1 is real time)")
     changes = [f"{k}={v}" for k in ("airframe", "personality", "seed") if (v := getattr(args, k)) is not None]
     sitl = config.load(args.config, [*changes, *args.set])
-    flight = shell.Run(sitl, args.lockstep, args.log, args.exit_when_landed, args.max_time)
+    key, signer = args.signing_key or sitl.signing_key, None
+    if key:
+        beside = args.log.with_suffix(".signing") if args.log else Path(f"{key}.sitl-{sitl.system}-{sitl.component}")
+        signer = signing.open_signer(key, args.signing_state or beside)
+    flight = shell.Run(sitl, args.lockstep, args.log, args.exit_when_landed, args.max_time, signer)
     if args.socket_fd is not None:
         flight.ports.adopt(args.socket_fd)
     for endpoint in args.endpoint or ([DEFAULT_ENDPOINT] if args.socket_fd is None else []):

@@ -181,6 +181,10 @@ class Sitl(config.Section, frozen=True):
     faults: list[Fault] = field(default_factory=list)
     battery_s: float = 0.0  # flight time of a full battery; 0 never ends
     params: dict[str, float] = field(default_factory=dict)
+    accept_from: list[tuple[int, int]] = field(
+        default_factory=list
+    )  # (system, component; 0 any) whose setpoints and commands are taken; empty: everybody's
+    signing_key: str = ""  # a file with the key of MAVLink 2 signing; empty: nothing is signed
 
     def __post_init__(self) -> None:
         if not 0 <= self.seed < 2**32:

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
 
 _AUTOPILOT_VERSION = wire.ID["AUTOPILOT_VERSION"]
 _REBOOT_WAIT_US = 100_000
+_COMMANDS = (wire.ID["COMMAND_LONG"], wire.ID["COMMAND_INT"])
+_QUESTIONS = frozenset(
+    wire.ID[name] for name in ("TIMESYNC", "PING", "PARAM_REQUEST_LIST", "PARAM_REQUEST_READ", "MISSION_REQUEST_LIST")
+)
 
 
 class Services:
@@ -57,6 +61,18 @@ class Services:
             512: lambda link, frame, p: self._request(link, _number(p[0])),
             520: lambda link, frame, p: self._request(link, _AUTOPILOT_VERSION),
         }
+
+    def allowed(self, frame: Frame) -> bool:
+        """Whether its sender may have this: anybody may ask, only listed systems may change anything."""
+        listed = self._sim.config.accept_from
+        if not listed or frame.msgid in _QUESTIONS:
+            return True
+        return (frame.system, frame.component) in listed or (frame.system, 0) in listed
+
+    def deny(self, link: Link, frame: Frame, m: Any) -> None:
+        """A command of somebody who is not listed is answered; nothing else is."""
+        if frame.msgid in _COMMANDS:
+            self._sim.send(link, "COMMAND_ACK", (m.command, DENIED, 0, 0, frame.system, frame.component))
 
     def tick(self) -> None:
         """Each 20 ms: the next few parameters of a list."""

@@ -12,6 +12,7 @@ from typing import Any, TextIO
 
 from mavquad.errors import ConfigError, FlightError, LinkError
 from mavquad.link import tlog
+from mavquad.link.signing import Signer
 from sitl.config import Sitl
 from sitl.links import Link
 from sitl.simulation import Simulation
@@ -138,9 +139,19 @@ class Ports:
 class Run:
     """One run of the program: `lockstep()` or `realtime(speed)`, then `report()`."""
 
-    def __init__(self, sitl: Sitl, lockstep: bool, log: Path | None, landed_s: float | None, max_time_s: float | None) -> None:
+    def __init__(
+        self,
+        sitl: Sitl,
+        lockstep: bool,
+        log: Path | None,
+        landed_s: float | None,
+        max_time_s: float | None,
+        signer: Signer | None = None,
+    ) -> None:
         self._writer = tlog.Writer(log) if log else None
-        self.sim = Simulation(sitl, self._writer.write_all if self._writer else None, lockstep)
+        self.sim = Simulation(sitl, self._writer.write_all if self._writer else None, lockstep, signer)
+        if signer is not None and not lockstep:  # simulation time 0 is now
+            signer.offset_us = time.time_ns() // 1000 - self.sim.epoch_us
         self.ports = Ports(self.sim)
         self._landed_us = None if landed_s is None else round(1e6 * landed_s)
         self._max_us = None if max_time_s is None else round(1e6 * max_time_s)
@@ -203,6 +214,7 @@ class Run:
             "setpoint_misses": sim.misses,
             "messages_sent": sum(link.sent for link in sim.links),
             "messages_received": sum(link.received for link in sim.links),
+            "frames_refused": sim.refused,
             "bytes_refused": sum(link.refused for link in sim.links),
             "landed": sim.autopilot.ended_us >= 0 and sim.autopilot.landed,
             "crashed": sim.autopilot.crashed,
@@ -214,6 +226,8 @@ class Run:
         self.ports.close()
         if self._writer:
             self._writer.close()
+        if self.sim.signer is not None:
+            self.sim.signer.close()
 
     def _over(self) -> bool:
         sim = self.sim

@@ -9,6 +9,7 @@ from typing import Any
 
 from mavquad import wire
 from mavquad.errors import WireError
+from mavquad.link.signing import SETUP_SIGNING, Signer
 from mavquad.wire import Frame
 from sitl import ardupilot, config, links, px4, telemetry
 from sitl.autopilot import TICK_US, Autopilot, check_airframe
@@ -34,8 +35,11 @@ class Simulation:
     With `lockstep` time waits (in the shell) for a companion: its first HEARTBEAT, then an answer to each period's barrier.
     """
 
-    def __init__(self, sitl: config.Sitl, record: Record | None = None, lockstep: bool = False) -> None:
-        self.config, self.lockstep = sitl, lockstep
+    def __init__(
+        self, sitl: config.Sitl, record: Record | None = None, lockstep: bool = False, signer: Signer | None = None
+    ) -> None:
+        self.config, self.lockstep, self.signer = sitl, lockstep, signer
+        self.refused: dict[str, int] = {}  # whole frames, by reason
         self.epoch_us = config.EPOCH_US
         self.vehicle = Helicopter(sitl) if config.vehicles(sitl)[1].kind == "helicopter" else Vehicle(sitl)
         check_airframe(self.vehicle)
@@ -91,9 +95,12 @@ class Simulation:
         frames, refused, rest = wire.split(data)
         link.refused += refused + len(rest)
         for frame in frames:
+            if frame.msgid == SETUP_SIGNING:  # it carries a key: kept nowhere
+                self._refuse("a key sent over the link")
+                continue
             if self.lockstep and self.periods <= 1 and self._is_start(link, frame):
                 continue
-            if frame.msgid == _TIMESYNC and link is self.partner and self._answers(frame):
+            if frame.msgid == _TIMESYNC and link is self.partner and self._answers(frame) and not self._forged(frame):
                 answered = True
             else:
                 link.up.put(self.t_us, frame.raw if link.up.faulty else frame)
@@ -240,7 +247,12 @@ class Simulation:
         self._stream_us = next_us
 
     def _frame(self, link: Link, item: Any) -> bytes:
-        raw: bytes = item if isinstance(item, bytes) else link.encode(item)
+        if isinstance(item, bytes):  # another's, forwarded as it came
+            raw = item
+        elif self.signer is None:
+            raw = link.encode(item)
+        else:
+            raw = self.signer.sign(link.encode(item), self.epoch_us + self.t_us, link.index & 0xFF)
         self._log(raw)
         return raw
 
@@ -252,8 +264,18 @@ class Simulation:
         m = wire.decode(frame)
         return bool(m.ts1 == self._barrier_ns and m.tc1 != 0)
 
+    def _forged(self, frame: Frame) -> bool:
+        """Whether a frame of the lockstep itself is not our partner's; its time is that of the barrier."""
+        return self.signer is not None and self.signer.refuses(frame, self.epoch_us + self.t_us, new=False) != ""
+
+    def _refuse(self, reason: str) -> None:
+        self.refused[reason] = self.refused.get(reason, 0) + 1
+
     def _is_start(self, link: Link, frame: Frame) -> bool:
         """A companion repeats its first HEARTBEAT until time begins: one of them is kept, however often it came."""
+        if self._forged(frame):
+            self._refuse("badly signed")
+            return True
         if self.partner is None:
             if frame.msgid == _HEARTBEAT and frame.component == COMPANION:
                 self.partner = link
@@ -281,6 +303,10 @@ class Simulation:
         else:
             frames = [arrived]
         for frame in frames:
+            reason = self.signer.refuses(frame, self.epoch_us + self.t_us) if self.signer else ""
+            if reason:
+                self._refuse(reason)
+                continue
             link.received += 1
             link.speakers.add((frame.system, frame.component))
             if frame.msgid not in wire.ID_SET:
@@ -296,8 +322,13 @@ class Simulation:
             if len(self.links) > 1 and not (ours and system and component):
                 self._forward(link, frame, system, component)
             handler = self._services.handlers.get(frame.msgid) if ours else None
-            if handler is not None:
+            if handler is None:
+                continue
+            if self._services.allowed(frame):
                 handler(link, frame, m)
+            else:
+                self._refuse("not from a listed system")
+                self._services.deny(link, frame, m)
 
     def _forward(self, source: Link, frame: Frame, system: int, component: int) -> None:
         """To the links where the addressee was heard; to all others when it is for everybody."""

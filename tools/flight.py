@@ -69,6 +69,7 @@ def fly(run: Path, pace: Pace, max_time_s: float, watch: Watcher) -> Flown:
                           "--exit-when-landed", repr(_LANDED_S), "--max-time", repr(max_time_s), *pace.sitl()], (sock.fileno(),))  # fmt: skip
         companion = _start(
             run, "mavquad", ["--config", str(run / "companion.toml"), "--endpoint", endpoint, "--run", str(run), "--engage",
+                             "--signing-state", str(run / "companion.signing"),
                              *pace.companion()])  # fmt: skip
     said = _Tail(run / "companion.txt")
     problems: list[str] = []

@@ -44,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--attitude", choices=("ahrs", "mocap", "both"), default="ahrs", help="attitude source (default: %(default)s)"
     )
     parser.add_argument("--loop", choices=("attitude", "rates"), help="what setpoints carry")
+    parser.add_argument("--signing-key", default="", metavar="FILE", help="sign the whole flight with the key in FILE (0600)")
     parser.add_argument("--speed", type=float, metavar="F", help="F times real time (default: lockstep, as fast as it goes)")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change anything; again for more")
     parser.add_argument("--run", type=Path, metavar="DIR", help="run folder (default: runs/<time>-<scenario>-<seed>)")
@@ -111,6 +112,7 @@ def resolve(args: argparse.Namespace) -> Any:
         compensator=args.compensator,
         observers=args.observer,
         loop=args.loop,
+        signing_key=args.signing_key,
     )
     return scenarios.resolve(scenarios.load(args.scenario, [*args.set, *_axes(args)]), options)
 
@@ -124,10 +126,20 @@ def stages(companion: Any) -> str:
 def command(args: argparse.Namespace) -> str:
     """The command that repeats this flight."""
     words = ["mavquad", "fly", args.scenario, "--seed", str(args.seed)]
-    for name in ("personality", "airframe", "controller", "estimator", "compensator", "attitude", "loop", "speed"):
+    for name in (
+        "personality",
+        "airframe",
+        "controller",
+        "estimator",
+        "compensator",
+        "attitude",
+        "loop",
+        "signing_key",
+        "speed",
+    ):
         value = getattr(args, name)
-        if value not in (None, {"personality": "px4", "airframe": "x500", "attitude": "ahrs"}.get(name)):
-            words += [f"--{name}", str(value)]
+        if value not in (None, "", {"personality": "px4", "airframe": "x500", "attitude": "ahrs"}.get(name)):
+            words += [f"--{name.replace('_', '-')}", str(value)]
     for name in ("axis", "observer", "set"):
         for value in getattr(args, name) or []:
             words += [f"--{name}", value]

@@ -87,6 +87,7 @@ class Options(config.Section, frozen=True):
     compensator: str | None = None
     observers: list[str] | None = None
     loop: Literal["attitude", "rates"] | None = None
+    signing_key: str = ""  # a file, for both programs
 
 
 class Resolved(NamedTuple):
@@ -134,6 +135,7 @@ def resolve(scenario: Scenario, options: Options) -> Resolved:
         link=scenario.link,
         faults=scenario.faults,
         params={**PARAMS[options.personality], **scenario.params},
+        signing_key=options.signing_key,
     )
     if options.observers is None and options.attitude != "ahrs":
         options = msgspec.structs.replace(options, observers=[*MOCAP_OBSERVERS])
@@ -144,6 +146,7 @@ def resolve(scenario: Scenario, options: Options) -> Resolved:
             "takeoff_m": scenario.flight.takeoff_m,
             "seed": options.seed,
             "path": msgspec.to_builtins(scenario.path),
+            "link": {"signing_key": options.signing_key},
         },
         {**scenario.companion, **{name: value for name, value in chosen.items() if value is not None}},
     )

@@ -58,6 +58,7 @@ def summarise(run: Path, name: str, resolved: Resolved, flown: Flown, command: s
         "setpoint_misses": sitl.get("setpoint_misses"),
         "latency_us": said.get("latency_us"),
         "states": said.get("states", []),
+        "refused": {"companion": said.get("refused") or {}, "sitl": sitl.get("frames_refused") or {}},
         "granted_hz": said.get("rates_hz"),
         "delay_s": said.get("delay_s"),
         "solver": said.get("controller") or {},

@@ -15,6 +15,7 @@ from mavquad.errors import LinkError
 
 Address = tuple[str, int]
 _BUFFER = 4 << 20
+_PEERS = 16  # addresses that are answered
 _SPIN = 400  # tries, about half a millisecond
 NOWHERE: Address = ("", 0)
 
@@ -63,9 +64,14 @@ class UdpEndpoint:
 
     def _first(self) -> tuple[bytes, Address]:
         data, address = self.sock.recvfrom(65535)
-        if not self.fixed and address not in self.peers:
+        if not self.fixed and len(self.peers) < _PEERS and address not in self.peers:
             self.peers.append(address)
         return data, address
+
+    def answer(self, address: Address) -> None:
+        """Send to this address, too, whatever others have spoken: the autopilot is there."""
+        if address not in self.peers:
+            self.peers = [address, *self.peers[: _PEERS - 1]]
 
     def close(self) -> None:
         self.sock.close()
