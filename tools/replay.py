@@ -1,17 +1,21 @@
-"""mavquad replay: run the pipeline over a recorded flight of any autopilot; compare body rates; check that a flight replays.
+"""mavquad replay: a recorded flight of any autopilot as one page: observers, disturbance, wind, link, what would have been commanded.
 
-Without options: what the log holds, and the body rates of its attitude by the observer beside plain differences.
+Without options: every observer over the log, one self-contained page (its path is printed last), and the body rates compared.
+--compare judges the observers: against the truth of a simulated flight, else against an offline smoother of the same measurements.
+--what-if CONTROLLER says what another companion would have commanded.
 --verify feeds a flight of ours again: every frame that was sent, and every value of the trace, must come out bit for bit.
 
 Example:
-  mavquad replay flight.tlog --observer gsmo --json
+  mavquad replay flight.tlog
+  mavquad replay flight.tlog --observer gsmo:variant=relay --observer joint:lead_s=0.1 --observer joint --compare
+  mavquad replay flight.ulg --what-if controller=iadrc --what-if controller=pid,compensator=asmf
   mavquad replay runs/20250101-120000-circle-7/flight.tlog --verify
-  mavquad replay flight.tlog --observer gsmo:variant=relay --observer gsmo --from 55 --to 250
 """
 
 import argparse
 import csv
 import json
+import os
 import sys
 import time
 from pathlib import Path
@@ -23,18 +27,33 @@ from mavquad.errors import ConfigError, FlightError, LogError
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of a replay."""
     parser.add_argument("log", type=Path, help="a .tlog file; or a PX4 .ulg, an ArduPilot .bin")
-    parser.add_argument("--verify", action="store_true", help="compare with what was sent then; exit 1 where the two part")
-    parser.add_argument("--plan", type=Path, help="the flight's plan.toml (default: beside the log, where there is one)")
-    parser.add_argument("--config", type=Path, help="a companion.toml to run instead of the flight's own")
     parser.add_argument(
-        "--observer", action="append", metavar="NAME[:KEY=VALUE,...]", help="what to run; again for more (gsmo)"
+        "--out", type=Path, metavar="FILE", help="where to write the page (default: LOG.replay.html beside the log)"
     )
+    parser.add_argument(
+        "--observer", action="append", metavar="NAME[:KEY=VALUE,...]", help="what to run; again for more (default: every one)"
+    )
+    parser.add_argument("--compare", action="store_true", help="judge the observers against truth, or an offline smoother")
+    parser.add_argument(
+        "--what-if",
+        action="append",
+        metavar="KEY=VALUE,...",
+        help="e.g. controller=iadrc,compensator=asmf: what it would have commanded",
+    )
+    parser.add_argument(
+        "--airframe", metavar="NAME", help="the vehicle (default: the flight's own, else the numbers of the x500)"
+    )
+    parser.add_argument("--system", type=int, metavar="ID", help="the vehicle's system id, where the log holds several")
+    parser.add_argument("--component", type=int, metavar="ID", help="its component id")
     parser.add_argument(
         "--from", dest="from_s", type=float, metavar="S", help="seconds after the log's start (default: airborne)"
     )
     parser.add_argument("--to", dest="to_s", type=float, metavar="S", help="until then")
+    parser.add_argument("--verify", action="store_true", help="compare with what was sent then; exit 1 where the two part")
+    parser.add_argument("--plan", type=Path, help="the flight's plan.toml (default: beside the log, where there is one)")
+    parser.add_argument("--config", type=Path, help="a companion.toml to run instead of the flight's own")
     parser.add_argument("--csv", type=Path, metavar="FILE", help="the pipeline's trace, a row per control step (.parquet too)")
-    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+    parser.add_argument("--json", action="store_true", help="print everything as JSON; a page only where --out says so")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -43,19 +62,18 @@ def run(args: argparse.Namespace) -> int:
         return _verify(args)
     from mavquad.link import recording
     from mavquad.link.columns import Log
-    from tools import survey, survey_aboard
+    from tools import replayed, survey
 
     begun = time.perf_counter()
-    observers = args.observer or ["gsmo"]
-    log: Any
-    if recording.kept_aboard(args.log):
-        if args.csv:
-            raise ConfigError(f"{args.log}: --csv runs the pipeline over MAVLink frames; a log kept aboard holds none")
-        log = recording.open_recording(args.log)
-        result = survey_aboard.survey(log, observers, args.from_s, args.to_s)
-    else:
-        log = Log(args.log)
-        result = survey.survey(log, observers, args.from_s, args.to_s)
+    log = None if recording.kept_aboard(args.log) else Log(args.log)
+    if args.csv and log is None:
+        raise ConfigError(f"{args.log}: --csv runs the pipeline over MAVLink frames; a log kept aboard holds none")
+    chosen = replayed.Chosen(
+        args.observer, args.compare, args.what_if or [], args.airframe, args.system, args.component, args.from_s, args.to_s
+    )
+    wanted = args.out or (None if args.json or args.csv else _page(args.log))
+    companion = _settings(args) if args.config else None
+    result = replayed.replay(args.log, log, chosen, companion, wanted, _command(args))
     if args.csv:
         result["trace"] = _write_trace(args, log)
     result["wall_s"] = time.perf_counter() - begun
@@ -63,21 +81,48 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps(survey.finite(result), allow_nan=False))
     else:
         survey.show(result)
-    if log.problem:
-        print(f"note: {log.problem}", file=sys.stderr)
+        replayed.show(result)
+    if result["problem"]:
+        print(f"note: {result['problem']}", file=sys.stderr)
     return 0
+
+
+def _page(log: Path) -> Path:
+    """Where the page goes when nobody says: beside the log, or here where that folder takes no files."""
+    name = f"{log.name}.replay.html"
+    return log.with_name(name) if os.access(log.parent, os.W_OK) else Path(name)
+
+
+def _command(args: argparse.Namespace) -> list[str]:
+    """The command line again."""
+    words = [str(args.log)]
+    for name in ("observer", "what_if"):
+        for value in getattr(args, name) or ():
+            words += [f"--{name.replace('_', '-')}", value]
+    words += ["--compare"] if args.compare else []
+    for name, option in (
+        ("airframe", "--airframe"),
+        ("system", "--system"),
+        ("component", "--component"),
+        ("from_s", "--from"),
+        ("to_s", "--to"),
+        ("config", "--config"),
+    ):
+        if getattr(args, name) is not None:
+            words += [option, str(getattr(args, name))]
+    return words
 
 
 # ---- the pipeline over the log ------------------------------------------------------------------------------------------
 def _plan(args: argparse.Namespace) -> tuple[Any, tuple[str, ...]]:
     """The plan to run, and what differs between the flight's machine and this one."""
-    from mavquad import config, plan, plan_file
+    from mavquad import plan, plan_file
     from mavquad.settings import Companion
 
     if args.config:
         if args.verify:
             raise ConfigError("--verify compares with the flight's own plan; leave out --config")
-        settings = config.load(args.config, Companion)
+        settings = _settings(args)
     else:
         beside = args.plan or plan_file.beside(args.log)
         if args.plan or args.verify or beside.exists():
@@ -85,6 +130,13 @@ def _plan(args: argparse.Namespace) -> tuple[Any, tuple[str, ...]]:
             return plan.build(recorded.companion, recorded.airframe), recorded.here
         settings = Companion()
     return plan.build(settings), ()
+
+
+def _settings(args: argparse.Namespace) -> Any:
+    from mavquad import config
+    from mavquad.settings import Companion
+
+    return config.load(args.config, Companion)
 
 
 def _write_trace(args: argparse.Namespace, log: Any) -> dict[str, Any]:

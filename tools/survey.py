@@ -17,8 +17,21 @@ _IN_AIR = 2  # MAV_LANDED_STATE
 SLOW_HZ = 40.0  # below this, rates of a multirotor cannot be had from attitude
 
 
-def survey(log: Log, observers: list[str], from_s: float | None, to_s: float | None) -> dict[str, Any]:
-    """Everything `replay` prints. The span is [from_s, to_s) after the log's start; without both, the time in the air."""
+Kept = dict[str, tuple[NDArray[np.int64], rates.Array]]  # by name: vehicle time (n,), body rates (n, 3)
+
+
+def survey(
+    log: Log,
+    observers: list[str],
+    from_s: float | None,
+    to_s: float | None,
+    keep: Kept | None = None,
+    system: int | None = None,
+) -> dict[str, Any]:
+    """Everything `replay` prints. The span is [from_s, to_s) after the log's start; without both, the time in the air.
+
+    `keep` takes the rates themselves, for a figure; `system` chooses the vehicle where the log holds several.
+    """
     result: dict[str, Any] = {
         "log": str(log.path),
         "bytes": log.size,
@@ -30,7 +43,7 @@ def survey(log: Log, observers: list[str], from_s: float | None, to_s: float | N
         "notes": not_enough_for(log),
     }
     try:
-        result["rates"] = body_rates(log, observers, from_s, to_s)
+        result["rates"] = body_rates(log, observers, from_s, to_s, keep, system)
     except LogError as error:
         result["rates"] = {"problem": str(error)}
     return result
@@ -54,9 +67,16 @@ def streams(log: Log) -> list[dict[str, Any]]:
     return rows
 
 
-def body_rates(log: Log, observers: list[str], from_s: float | None, to_s: float | None) -> dict[str, Any]:
+def body_rates(
+    log: Log,
+    observers: list[str],
+    from_s: float | None,
+    to_s: float | None,
+    keep: Kept | None = None,
+    system: int | None = None,
+) -> dict[str, Any]:
     """rms of each way to the body rates against the zero-phase rate of the same quaternions [rad/s, x y z]."""
-    source = _attitude_stream(log)
+    source = _attitude_stream(log, system)
     rows = log.rows(source)
     a = rates.attitudes(
         1000 * rows["time_boot_ms"].astype(np.int64), np.column_stack([rows[f"q{i}"] for i in (1, 2, 3, 4)]).astype(float)
@@ -69,10 +89,10 @@ def body_rates(log: Log, observers: list[str], from_s: float | None, to_s: float
         raise LogError(f"{int(use.sum())} attitude samples between {span[0]:.1f} and {span[1]:.1f} s, at least 100 are needed")
     torque, torque_text = _torque(log, source, a, use)
     reported = np.column_stack([rows[f"{k}speed"] for k in ("roll", "pitch", "yaw")]).astype(float)
-    keep = np.searchsorted(a.t_us, 1000 * rows["time_boot_ms"].astype(np.int64))
+    places = np.searchsorted(a.t_us, 1000 * rows["time_boot_ms"].astype(np.int64))
     told = np.full_like(reference, np.nan)
-    told[np.minimum(keep, len(told) - 1)] = reported
-    ways = compare(a, reference, use, observers, torque, told)
+    told[np.minimum(places, len(told) - 1)] = reported
+    ways = compare(a, reference, use, observers, torque, told, keep=keep)
     return {
         "source": f"{source.system}/{source.component} {source.name}",
         "sample_hz": hz,
@@ -97,6 +117,7 @@ def compare(
     torque: rates.Array | None,
     told: rates.Array,
     outputs: str = "SERVO_OUTPUT_RAW",
+    keep: Kept | None = None,
 ) -> list[dict[str, Any]]:
     """Each way to the body rates and its rms error per axis over the samples `use`; `told` (n, 3) are the autopilot's own."""
     plain = rates.difference(a)
@@ -105,9 +126,15 @@ def compare(
     def way(name: str, torque: str, rate: rates.Array, **more: Any) -> None:
         ways.append({"method": name, "torque": torque, "rms_rad_s": rates.rms(rate - reference, use), **more})
 
+    if keep is not None:
+        keep["reference"] = (a.t_us, reference)
+        if np.isfinite(told[use]).any():
+            keep["autopilot"] = (a.t_us, told)
     for label in observers:
         w, counts = _observe(label, a, None)
         way(label, "unknown", w, rejected=counts)
+        if keep is not None:
+            keep[label] = (a.t_us, w)
         if torque is not None:
             way(label, f"from {outputs}", _observe(label, a, torque)[0])
     way("difference", "-", plain)
@@ -119,8 +146,8 @@ def compare(
     return ways
 
 
-def _attitude_stream(log: Log) -> Stream:
-    found = log.find("ATTITUDE_QUATERNION")
+def _attitude_stream(log: Log, system: int | None) -> Stream:
+    found = log.find("ATTITUDE_QUATERNION", system)
     if not found:
         raise LogError(f"{log.path}: no ATTITUDE_QUATERNION in it: no body rates from attitude")
     return max(found, key=lambda s: (s.component == 1, s.messages))

@@ -11,7 +11,9 @@ from tools import rates
 from tools import survey as tlog_survey
 
 
-def survey(recording: Recording, observers: list[str], from_s: float | None, to_s: float | None) -> dict[str, Any]:
+def survey(
+    recording: Recording, observers: list[str], from_s: float | None, to_s: float | None, keep: tlog_survey.Kept | None = None
+) -> dict[str, Any]:
     """Everything `replay` prints, in the form it has for a tlog. The span counts from the first attitude."""
     t_us = [table["t_us"] for table in recording.tables.values()]
     result: dict[str, Any] = {
@@ -25,13 +27,15 @@ def survey(recording: Recording, observers: list[str], from_s: float | None, to_
         "notes": not_enough_for(recording),
     }
     try:
-        result["rates"] = _rates(recording, observers, from_s, to_s)
+        result["rates"] = _rates(recording, observers, from_s, to_s, keep)
     except LogError as error:
         result["rates"] = {"problem": str(error)}
     return result
 
 
-def _rates(recording: Recording, observers: list[str], from_s: float | None, to_s: float | None) -> dict[str, Any]:
+def _rates(
+    recording: Recording, observers: list[str], from_s: float | None, to_s: float | None, keep: tlog_survey.Kept | None
+) -> dict[str, Any]:
     """rms of each way to the body rates against the zero-phase rate of the same quaternions; the span counts from the first sample."""
     if Attitude not in recording.signals:
         raise LogError(f"{recording.path}: no attitude in it: no body rates")
@@ -57,7 +61,7 @@ def _rates(recording: Recording, observers: list[str], from_s: float | None, to_
         "span": "the whole log" if from_s is None and to_s is None else "as asked for",
         "reference": "zero-phase rate of the same quaternions (central difference)",
         "signal_rms_rad_s": rates.rms(reference, use),
-        "ways": tlog_survey.compare(a, reference, use, observers, torque, told, outputs.source if outputs else "-"),
+        "ways": tlog_survey.compare(a, reference, use, observers, torque, told, outputs.source if outputs else "-", keep),
         "torque_model": model,
         "note": tlog_survey.slow_note(hz),
     }

@@ -17,6 +17,8 @@ from mavquad.link import bulk, signals
 from mavquad.link.columns import Log
 from mavquad.signals import Attitude, Imu, Mocap, Motors, Position, Target
 
+_AUTOPILOT = 1  # MAV_COMP_ID_AUTOPILOT1: of several senders of one vehicle (a camera, a companion) the one that is meant
+
 Array = NDArray[Any]
 Kind = type[Attitude] | type[Imu] | type[Mocap] | type[Motors] | type[Position] | type[Target]
 
@@ -123,8 +125,9 @@ def from_tlog(log: Log, *, system: int | None = None, component: int | None = No
 def _sender(log: Log, system: int | None, component: int | None) -> tuple[int, int]:
     senders = sorted({(s.system, s.component) for s in log.streams if s.name in ("ATTITUDE", "ATTITUDE_QUATERNION")})
     chosen = [s for s in senders if system in (None, s[0]) and component in (None, s[1])]
-    if len(chosen) == 1:
-        return chosen[0]
+    autopilots = [s for s in chosen if s[1] == _AUTOPILOT]
+    if len(chosen) == 1 or len(autopilots) == 1:
+        return (autopilots or chosen)[0]
     names = ", ".join(f"{s}/{c}" for s, c in senders) or "nobody"
     raise LogError(f"{log.path}: attitude comes from {names}; expected one vehicle: choose it with --system and --component")
 

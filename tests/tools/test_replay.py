@@ -56,9 +56,11 @@ def test_the_span_can_be_chosen_and_an_empty_one_is_said(capsys):
     assert "at least 100 are needed" in r["problem"]
 
 
-def test_people_get_a_table(capsys):
-    assert tools_main.main(["replay", str(SWEEP)]) == 0
+def test_people_get_a_table(capsys, tmp_path):
+    page = tmp_path / "page.html"
+    assert tools_main.main(["replay", str(SWEEP), "--out", str(page)]) == 0
     shown = capsys.readouterr().out
+    assert shown.splitlines()[-1] == str(page)
     assert "ATTITUDE_QUATERNION" in shown
     assert "difference, 20 Hz Butterworth" in shown
 

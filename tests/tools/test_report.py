@@ -2,19 +2,17 @@
 
 import json
 import re
-import shutil
-import subprocess
 
 import numpy as np
 import pytest
 
 from mavquad.errors import LogError
+from tests.oracles import browser
 from tools import __main__ as tools_main
 from tools import page as pages
 from tools import report
 
 pytestmark = pytest.mark.xdist_group("flights")
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 
 
 @pytest.fixture(scope="session")
@@ -72,37 +70,10 @@ def test_spans_are_found_and_merged_until_they_can_be_drawn():
     assert len(report._spans(t, on, most=10)) <= 10
 
 
-WATCH = """<script>window.seen = [];
-addEventListener("error", (e) => seen.push("error: " + e.message));
-addEventListener("unhandledrejection", (e) => seen.push("rejected: " + e.reason));
-document.addEventListener("securitypolicyviolation", (e) => seen.push("asked for " + e.blockedURI));
-const say = console.error; console.error = (...words) => { seen.push("console: " + words.join(" ")); say(...words); };
-</script>"""
-PROBE = """<script>(async () => {
-  while (!document.documentElement.dataset.drawn) await new Promise((r) => setTimeout(r, 50));
-  const plots = [...document.querySelectorAll(".plot")], linked = plots.filter((p) => p.dataset.linked === "time");
-  await Plotly.relayout(linked[0], {"xaxis.range": [9, 10]});
-  await new Promise((r) => setTimeout(r, 1500));
-  const space = plots.find((p) => p.layout.scene), image = await Plotly.toImage(space, {format: "png", width: 500, height: 400});
-  const out = document.createElement("pre"); out.id = "probe";
-  out.textContent = JSON.stringify({seen, plots: plots.length, drawn: plots.filter((p) => p.querySelector(".main-svg")).length,
-    ranges: linked.map((p) => p.layout.xaxis.range), image: image.length, canvas: !!space.querySelector("canvas")});
-  document.body.append(out);
-})();</script>"""
-
-
-@pytest.mark.skipif(BROWSER is None, reason="no chromium on this machine; Debian's package is enough")
+@pytest.mark.skipif(browser.BROWSER is None, reason="no chromium on this machine; Debian's package is enough")
 @pytest.mark.slow
 def test_a_browser_draws_it_all_zooms_together_and_finds_no_error(page, tmp_path):
-    text = page.read_text().replace("<title>", WATCH + "<title>", 1).replace("</body>", PROBE + "</body>")
-    probed = tmp_path / "probed.html"
-    probed.write_text(text)
-    options = "--headless --no-sandbox --disable-gpu --use-angle=swiftshader --enable-unsafe-swiftshader --window-size=1200,900"
-    command = [str(BROWSER), *options.split(), "--virtual-time-budget=60000", "--dump-dom", probed.as_uri()]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=True)
-    found = re.search(r'<pre id="probe">(.*?)</pre>', done.stdout)
-    assert found is not None
-    result = json.loads(found[1].replace("&amp;", "&").replace("&lt;", "<").replace("&gt;", ">"))
+    result = browser.probe(page, tmp_path)
     assert result["seen"] == []
     assert result["drawn"] == result["plots"] > 10
     assert result["ranges"] == [[9, 10]] * len(result["ranges"])
