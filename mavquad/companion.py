@@ -285,6 +285,7 @@ class Companion:
             self._stamp_us = max(self._stamp_us, clock.wall_us())
             for data, address in arrived:
                 before = self.setpoints
+                self._stamp_us = max(self._stamp_us, clock.wall_us())  # of what waited behind others, too: it is that late
                 self.take(self._frames(data, address), address, self._stamp_us)
                 self._flush()
                 if self.setpoints > before:

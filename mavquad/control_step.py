@@ -39,13 +39,19 @@ def step(plan: Plan, f: Flight, t_us: int, dt_s: float) -> None:
     applied = Applied(t_us, q_sent, f.applied_thrust_m_s2, sent.omega_rad_s if sent.type_mask != 7 else NAN3, f.delay_s)
     f.estimator, estimate = plan.estimator.module.step(plan.estimator.gains, f.estimator, applied, t_us)
     f.estimate = estimate
-    active = f.life.state in (STREAMING, ENGAGED) and f.anchor > 0
-    demand = demand_at(plan, f, t_us) if active else Demand(t_us, NAN3, ZERO3, ZERO3, ZERO3, 0.0, 0.0)
+    flying = f.life.state in (STREAMING, ENGAGED) and f.anchor > 0
+    active = flying and not f.catching_up
+    if f.catching_up:
+        f.skipped_s += dt_s
+    else:
+        dt_s, f.skipped_s, f.put_us = min(0.2, dt_s + f.skipped_s), 0.0, f.arrival_us
+    demand = demand_at(plan, f, t_us) if flying else Demand(t_us, NAN3, ZERO3, ZERO3, ZERO3, 0.0, 0.0)
     nominal = command = Command(NAN3, 0.0, 0.0, NAN3, ZERO3)
     if active:
         before = f.controller
+        gains = plan.slowed[f.slow - 1] if f.slow else plan.controller.gains
         f.controller, nominal = plan.controller.module.step(
-            plan.controller.gains, f.controller, estimate, demand, lambda t: demand_at(plan, f, t), dt_s
+            gains, f.controller, estimate, demand, lambda t: demand_at(plan, f, t), dt_s
         )
         command = nominal
         if hasattr(plan.controller.module, "messages"):  # a controller with something to say beside its setpoint

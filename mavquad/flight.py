@@ -54,6 +54,11 @@ class Flight:
     hover_thrust: float
     delay_s: float  # measured round trip
     lateness_us: int  # smallest arrival minus stamp seen: what counts as punctual
+    late_s: float  # our own lateness, the largest of late
+    catching_up: bool  # this sample is old and newer ones wait behind it: not worth a setpoint
+    skipped_s: float  # vehicle time that such samples took
+    put_us: int  # arrival time of the last control step
+    slow: int  # which of the slower designs we fly with; 0: none
     late_us: int  # since when we are late; 0: punctual
     interventions: int
     battery_percent: float
@@ -117,6 +122,7 @@ def forget(plan: Plan, f: Flight) -> None:
     f.own_attitude_loop = None
     f.sent, f.echo, f.applied_thrust_m_s2 = None, None, G_M_S2
     f.lateness_us, f.late_us = 1 << 62, 0
+    f.late_s, f.slow, f.catching_up, f.skipped_s, f.put_us = 0.0, 0, False, 0.0, 0
 
 
 def vehicle_now_us(f: Flight) -> int:

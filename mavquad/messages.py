@@ -39,7 +39,7 @@ def _timesync(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
         outbox.send(plan, f, "TIMESYNC", (publish.nanoseconds(f.arrival_us), m.ts1, frame.system, frame.component))
     elif (frame.system, frame.component) == f.life.target:
         round_trip_s = 1e-9 * (publish.nanoseconds(f.arrival_us) - m.ts1)
-        if 0.0 <= round_trip_s < 2.0:
+        if 0.0 <= round_trip_s < 2.0 and f.slow < 2:  # a late companion measures itself
             f.delay_s += (round_trip_s - f.delay_s) * (0.1 if f.delay_s else 1.0)
 
 

@@ -6,7 +6,7 @@ from dataclasses import fields as dataclass_fields
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from mavquad import adrc_checks, paths, publish, wire
+from mavquad import adrc_checks, paths, publish, slowing, wire
 from mavquad import airframe as airframes
 from mavquad.airframe import Airframe
 from mavquad.config import value as toml_value
@@ -57,6 +57,7 @@ class Plan(NamedTuple):
     samples: dict[int, str]  # messages whose samples some stage uses, by id
     trace_names: tuple[str, ...]
     warnings: tuple[str, ...]  # of the checks at design time: what will fly, but not well
+    slowed: tuple[Any, ...]  # the controller's gains for a late companion, by how late it is
 
 
 def stage(kind: str, spec: str, table: dict[str, str], tune: dict[str, dict[str, Any]], airframe: Airframe) -> Stage:
@@ -130,6 +131,7 @@ def build(settings: Companion, airframe: Airframe | None = None) -> Plan:
         _samples((estimator_stage, controller_stage, compensator, *observers)),
         publish.trace_names(tuple(s.label for s in observers), compensator.module if compensator else None),
         tuple(adrc_checks.enforce(_checks(estimator_stage, controller_stage))),
+        slowing.designs(controller_stage.module, controller_stage.params, airframe),
     )
 
 

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from mavquad import control_step, lifecycle, outbox, wire
+from mavquad import control_step, lifecycle, outbox, slowing, wire
 from mavquad.errors import LinkError
 from mavquad.flight import Flight, forget
 from mavquad.lifecycle import ENGAGED, OBSERVING, STREAMING
@@ -14,6 +14,7 @@ from mavquad.wire import Frame
 
 _BEHIND_US, _BEHIND_MANY = 500_000, 30  # no link delivers so many in a row so late: a clock restarted soon after it started
 _LATE_US = 2_000_000  # a stamp further back than this is a restarted clock, not a late message
+_OLD_US = 60_000  # a sample this late, right behind another, comes out of a queue
 _DOUBLED_US = 500_000  # ATTITUDE is left out while the quaternion was heard so recently
 
 
@@ -72,7 +73,16 @@ def _punctual(plan: Plan, f: Flight, t_us: int) -> None:
     """Our own lateness: arrival against stamp, beside the best seen (which may creep up, clocks drift)."""
     offset = f.arrival_us - t_us
     f.lateness_us = min(offset, f.lateness_us + 20)
-    if offset - f.lateness_us > round(1e6 * plan.settings.safety.late_s):
+    late_us = offset - f.lateness_us
+    f.catching_up = late_us > _OLD_US and f.arrival_us - f.put_us < plan.control_us // 2
+    f.late_s = slowing.fade(f.late_s, 1e-6 * late_us, 1e-6 * f.control_gap_us)
+    slow = slowing.level(f.slow, f.late_s)
+    if slow != f.slow:
+        f.slow = slow
+        if f.life.state in (STREAMING, ENGAGED):
+            words = f"{1e3 * f.late_s:.0f} ms late, flying slower" if slow else "in time again"
+            outbox.say(plan, f, words, 4 if slow else 6)
+    if late_us > round(1e6 * plan.settings.safety.late_s):
         f.late_us = f.late_us or f.arrival_us
     else:
         f.late_us = 0

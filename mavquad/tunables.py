@@ -7,6 +7,7 @@ import dataclasses
 import re
 from typing import Any, NamedTuple
 
+from mavquad import slowing
 from mavquad.errors import ConfigError
 from mavquad.plan import Plan, Stage
 
@@ -49,6 +50,8 @@ def change(plan: Plan, name: str, value: float) -> Plan:
             params: Any = dataclasses.replace(stage.params, **{tunable.field: float(value)})
             changed = stage._replace(params=params, gains=stage.module.gains(params, plan.airframe))
             places: dict[str, Any] = {tunable.place: changed}
+            if tunable.place == "controller":
+                places["slowed"] = slowing.designs(stage.module, params, plan.airframe)
             return plan._replace(**places)
     known = ", ".join(t.name for t in tunables(plan))
     raise ConfigError(f"no parameter is called {name!r}; known: {known}")
