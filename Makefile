@@ -1,14 +1,14 @@
-# make fly: install, fly the default scenario, say where the report lies.  make test: install, lint, contracts, tests.
+# make fly: install, fly the default scenario by pid and by the best, say where the page lies.  make test: install, lint, contracts, tests.
 PYTHON ?= python3
 BIN := .venv/bin
 CLIENTS := .venv-clients
 STAMP := .venv/.installed
-SCENARIO ?= circle
+SCENARIO ?= gusty
 
 .PHONY: fly test test-page long install test-clients lint clean
 
 fly: install
-	@$(BIN)/mavquad fly $(SCENARIO)
+	@$(BIN)/mavquad versus $(SCENARIO)
 
 install: $(STAMP)
 	@$(BIN)/python -m tools.warm

@@ -54,28 +54,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """One flight. 0 where it went well, 1 where not."""
-    from mavquad import plan
-    from tools import flight, summary, warm
+    from tools import summary
 
     if args.speed is not None and not 0.01 <= args.speed <= 1000.0:
         raise FlightError(f"--speed {args.speed}: expected 0.01 to 1000 times real time, or no --speed for lockstep")
-    resolved = resolve(args)
-    plan.build(resolved.companion)  # what is wrong with it is known before anything starts
     name = Path(args.scenario).stem
     folder = args.run or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}-{args.seed}"
-    flight.prepare(folder, resolved)
-    max_time_s = resolved.scenario.flight.max_time_s
-    signal.signal(signal.SIGTERM, _terminated)
-    with Progress(summary.path_duration_s(resolved.companion), quiet=args.json) as progress:
-        warm.ensure(f"flight {stages(resolved.companion)}", lambda: warm.flight(resolved), progress.say)
-        flown = flight.fly(folder, flight.Pace(args.speed), max_time_s, progress.watch)
-        progress.say("scoring")
-        result = summary.summarise(folder, name, resolved, flown, command(args), args.speed is None)
-        if not args.no_report and not flown.problems:
-            from tools import report
-
-            progress.say("drawing the report")
-            report.flight(folder)
+    result = one(args, folder)
     if args.json:
         print(json.dumps(result, allow_nan=False))
     else:
@@ -83,6 +68,29 @@ def run(args: argparse.Namespace) -> int:
     if not result["ok"]:
         raise FlightError(f"the flight was not as it should be: {'; '.join(result['failures'])}; its logs are in {folder}")
     return 0
+
+
+def one(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Fly, score and draw into an empty folder; its summary. Raises ConfigError, FlightError."""
+    from mavquad import plan
+    from tools import flight, summary, warm
+
+    resolved = resolve(args)
+    plan.build(resolved.companion)  # what is wrong with it is known before anything starts
+    flight.prepare(folder, resolved)
+    max_time_s = resolved.scenario.flight.max_time_s
+    signal.signal(signal.SIGTERM, _terminated)
+    with Progress(summary.path_duration_s(resolved.companion), quiet=args.json) as progress:
+        warm.ensure(f"flight {stages(resolved.companion)}", lambda: warm.flight(resolved), progress.say)
+        flown = flight.fly(folder, flight.Pace(args.speed), max_time_s, progress.watch)
+        progress.say("scoring")
+        result = summary.summarise(folder, Path(args.scenario).stem, resolved, flown, command(args), args.speed is None)
+        if not args.no_report and not flown.problems:
+            from tools import report
+
+            progress.say("drawing the report")
+            report.flight(folder)
+    return result
 
 
 def _axes(args: argparse.Namespace) -> list[str]:
