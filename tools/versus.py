@@ -111,11 +111,10 @@ def draw(folder: Path, args: argparse.Namespace) -> Path:
     wanted = flights[0][0].vector("ref_p")
     plan_view.append(html.line("wanted", wanted[:, 1], wanted[:, 0], 3, dash="dot"))
     space.append(("wanted", wanted, 3))
-    truth = flights[1][1]
-    wind = [
-        html.line(f"wind, {k}", 1e-6 * truth.t_us, truth.extra[f"wind_{k[0]}"], i)
-        for i, k in enumerate(("north", "east", "down"))
-    ]
+    part, truth = flights[1]
+    during = (truth.t_us >= part.column("t_us")[0]) & (truth.t_us <= part.column("t_us")[-1])
+    t_s = 1e-6 * truth.t_us[during]
+    wind = [html.line(k, t_s, truth.extra[f"wind_{k[0]}"][during], i) for i, k in enumerate(("north", "east", "down"))]
     heads = ["flown by", "rmse, m", "largest error, m", "periods missed", "report"]
     table = [
         [n, (r["rmse_m"] or {})["position"], r["max_error_m"], r["setpoint_misses"], f"{s}/report.html"]
