@@ -30,7 +30,7 @@ test: lint
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m "not slow"
 
 test-page: install  # every page in a real browser: Debian's package chromium
-	$(BIN)/python -m pytest tests/tools/test_report.py tests/tools/test_replay_page.py -m slow
+	$(BIN)/python -m pytest tests/tools/test_report.py tests/tools/test_replay_page.py tests/tools/test_campaign_report.py -m slow
 
 long: install  # eighty minutes of vehicle time in lockstep: flat memory, no miss
 	$(BIN)/python -m pytest -s tests/loop/test_long_flight.py -m slow

@@ -54,6 +54,15 @@ def cards(entries: Iterable[tuple[str, str, str]]) -> str:
     return f'<div class="cards">{"".join(boxes)}</div>'
 
 
+class Markup(str):
+    """HTML that stands in a table as it is."""
+
+
+def link(words: str, target: str) -> Markup:
+    """A link to another page of ours by its relative path; nothing is loaded until somebody follows it."""
+    return Markup(f'<a href="{html.escape(target)}">{html.escape(words)}</a>')
+
+
 def table(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """A table; numbers to the right, floats with four digits, everything escaped."""
     lines = [list(row) for row in rows]
@@ -61,8 +70,7 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     right = [' class="n"' if n else "" for n in numeric]
     top = "".join(f"<th{c}>{html.escape(h)}</th>" for c, h in zip(right, heads, strict=True))
     body = "".join(
-        "<tr>" + "".join(f"<td{c}>{html.escape(_shown(x))}</td>" for c, x in zip(right, line, strict=True)) + "</tr>"
-        for line in lines
+        "<tr>" + "".join(f"<td{c}>{_cell(x)}</td>" for c, x in zip(right, line, strict=True)) + "</tr>" for line in lines
     )
     return f'<div class="scroll"><table><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
 
@@ -146,6 +154,15 @@ def bars(name: str, labels: Sequence[str], values: Sequence[float], colour: int 
     return go.Bar(x=list(labels), y=_f4(values), name=name, marker={"color": COLOURS[colour]})
 
 
+def boxes(name: str, categories: Sequence[str], values: Any, colour: int = 0, labels: Sequence[str] | None = None) -> Any:
+    """The distribution of values in each category as a box, every value beside it; `labels` are shown under the pointer."""
+    mark = {"color": COLOURS[colour], "size": 4}
+    return go.Box(
+        x=list(categories), y=_f4(values), name=name, marker=mark, line={"width": 1.5}, boxpoints="all", jitter=0.4,
+        pointpos=0.0, text=labels, hoverinfo="all",
+    )  # fmt: skip
+
+
 def spans(entries: Iterable[tuple[str, float, float, str, int]]) -> list[Any]:
     """(row, from, to, what, colour) as bars on a time line."""
     return [
@@ -221,6 +238,10 @@ def thin(x: np.ndarray, y: np.ndarray, points: int) -> tuple[np.ndarray, np.ndar
 
 def _f4(values: Any) -> np.ndarray:
     return np.asarray(values, np.float32)
+
+
+def _cell(value: Any) -> str:
+    return value if isinstance(value, Markup) else html.escape(_shown(value))
 
 
 def _shown(value: Any) -> str:

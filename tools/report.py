@@ -1,8 +1,9 @@
-"""mavquad report: the run folder of a flight as one page: how it went, how we know, compared with what, and how to repeat it.
+"""mavquad report: a flight's run folder, or a campaign's results, as one page: how it went, how we know, compared with what.
 
 Example:
   mavquad report runs/20250101-120000-circle-7
   mavquad report runs/20250101-120000-circle-7 --out circle.html
+  mavquad report reference.sqlite --baseline pid
 """
 
 import argparse
@@ -28,13 +29,19 @@ _ARROWS = 14
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of a report."""
-    parser.add_argument("run", type=Path, help="a run folder")
+    parser.add_argument("run", type=Path, help="a run folder, or the SQLite file of a campaign")
     parser.add_argument("--out", type=Path, metavar="FILE", help="where to write it (default: report.html in the folder)")
+    parser.add_argument("--baseline", metavar="VARIANT", help="of a campaign: what the others are compared with (default: pid)")
 
 
 def run(args: argparse.Namespace) -> int:
     """Write the page and say where it lies."""
-    print(flight(args.run, args.out))
+    if args.run.is_file():
+        from tools import campaign_report
+
+        print(campaign_report.write(args.run, args.out, args.baseline))
+    else:
+        print(flight(args.run, args.out))
     return 0
 
 

@@ -17,9 +17,9 @@ const say = console.error; console.error = (...words) => { seen.push("console: "
 PROBE = """<script>(async () => {
   while (!document.documentElement.dataset.drawn) await new Promise((r) => setTimeout(r, 50));
   const plots = [...document.querySelectorAll(".plot")], linked = plots.filter((p) => p.dataset.linked === "time");
-  await Plotly.relayout(linked[0], {"xaxis.range": [9, 10]});
+  if (linked.length) await Plotly.relayout(linked[0], {"xaxis.range": [9, 10]});
   await new Promise((r) => setTimeout(r, 1500));
-  const space = plots.find((p) => p.layout.scene) || linked[0];
+  const space = plots.find((p) => p.layout.scene) || linked[0] || plots[0];
   const image = await Plotly.toImage(space, {format: "png", width: 500, height: 400});
   const out = document.createElement("pre"); out.id = "probe";
   out.textContent = JSON.stringify({seen, plots: plots.length, drawn: plots.filter((p) => p.querySelector(".main-svg")).length,

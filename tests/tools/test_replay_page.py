@@ -18,6 +18,7 @@ from tools import __main__ as tools_main
 from tools import page as pages
 from tools import recorded, smooth, what_if
 
+pytestmark = pytest.mark.xdist_group("flights")
 DATA = Path(__file__).resolve().parents[1] / "data"
 SWEEP, FLIGHT = DATA / "sweep-roll-20s.tlog", DATA / "flight1-20s.tlog"
 
