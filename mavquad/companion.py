@@ -29,7 +29,7 @@ from mavquad.relay import Relay
 from mavquad.wire import Frame
 
 _MAX_DATAGRAM = 1400
-_LOCKSTEP_WAIT_S = 10.0
+_LOCKSTEP_WAIT_S, _LOCKSTEP_POLL_S = 10.0, 0.2
 _SILENCE_S = 5.0
 _LATENCIES = 1 << 16  # the last ones, for the summary: memory stays flat however long the flight
 _RELAY_S = 0.02  # a further link waits no longer for us, however silent the autopilot is
@@ -327,24 +327,26 @@ class Companion:
 
     def _run_lockstep(self) -> None:
         hello = self._hello(clock.EPOCH_US - 1_000_000)  # one for all: how often it is sent must not show
-        heard = clock.monotonic_s()
+        waited_s = 0.0
         greeted = -1.0
         while True:
             if not self.flight.heartbeat_us and clock.monotonic_s() - greeted > 0.2:
                 greeted = clock.monotonic_s()
                 self.endpoint.send(hello)
-            arrived = self.endpoint.receive(0.0 if self._stop else 0.2)
+            asked = clock.monotonic_s()
+            arrived = self.endpoint.receive(0.0 if self._stop else _LOCKSTEP_POLL_S)
             begun = clock.monotonic_s()
             if not arrived:
                 if self._stop:
                     return
-                if begun - heard > _LOCKSTEP_WAIT_S and self.flight.heartbeat_us:
+                waited_s += min(2.0 * _LOCKSTEP_POLL_S, begun - asked)  # a machine put to sleep as a whole has not waited
+                if waited_s > _LOCKSTEP_WAIT_S and self.flight.heartbeat_us:
                     raise FlightError(
                         f"lockstep: no barrier from the autopilot for {_LOCKSTEP_WAIT_S:.0f} s; the flight is over"
                     )
-                self._complain(begun - heard)
+                self._complain(waited_s)
                 continue
-            heard = begun
+            waited_s = 0.0
             for data, address in arrived:
                 frames = self._frames(data, address)
                 if self._address not in (None, address):  # somebody else: outside of the periods

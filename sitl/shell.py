@@ -12,6 +12,7 @@ from typing import Any, TextIO
 
 from mavquad.errors import ConfigError, FlightError, LinkError
 from mavquad.link import tlog
+from mavquad.link.endpoint import Patience
 from mavquad.link.signing import Signer
 from sitl.config import Sitl
 from sitl.links import Link
@@ -19,7 +20,6 @@ from sitl.simulation import Simulation
 
 Address = tuple[str, int]
 ANSWER_S = 10.0  # the partner's time for one barrier
-_SPIN = 600  # tries for the next datagram before sleeping
 _POLL_S = 0.2  # how soon a signal is noticed
 _SLICE_US = 4_000  # of vehicle time at a speed
 _BEHIND_S = 0.25  # further behind the wall clock than this, the simulation stops trying to catch up
@@ -31,16 +31,22 @@ class Port:
     def __init__(self, sock: socket.socket, name: str) -> None:
         self.socket, self.name = sock, name
         self.links: dict[Address, Link] = {}
+        self.patience = Patience()
 
 
-def _spin(sock: socket.socket) -> tuple[bytes, Address]:
-    """The next datagram. The companion mostly answers at once: a few hundred tries are cheaper than to sleep and be woken."""
-    for _ in range(_SPIN):
+def _next(sock: socket.socket, patience: Patience) -> tuple[bytes, Address]:
+    """The next datagram, waited for."""
+    tries = patience.tries()
+    for _ in tries:
         try:
-            return sock.recvfrom(65536, socket.MSG_DONTWAIT)  # type: ignore[no-any-return]
+            found = sock.recvfrom(65536, socket.MSG_DONTWAIT)
         except BlockingIOError:
             continue
-    return sock.recvfrom(65536)  # type: ignore[no-any-return]
+        patience.learn(True)
+        return found
+    if tries:
+        patience.learn(False)
+    return sock.recvfrom(65536)
 
 
 class Ports:
@@ -115,7 +121,11 @@ class Ports:
         port.socket.settimeout(timeout_s)
         while True:
             try:
-                data, address = _spin(port.socket) if not flags and timeout_s >= _POLL_S else port.socket.recvfrom(65536, flags)
+                data, address = (
+                    _next(port.socket, port.patience)
+                    if not flags and timeout_s >= _POLL_S
+                    else port.socket.recvfrom(65536, flags)
+                )
             except (TimeoutError, BlockingIOError):
                 return answered
             except ConnectionError:
@@ -172,9 +182,12 @@ class Run:
             self.sim.run_period()
             self.ports.send()
             self.sim.record_period()
-            deadline_s = time.monotonic() + ANSWER_S
+            waited_s, since_s = 0.0, time.monotonic()
             while not self.ports.receive(_POLL_S) and not self._stop:
-                if time.monotonic() > deadline_s:
+                now_s = time.monotonic()
+                waited_s += min(2.0 * _POLL_S, now_s - since_s)  # a machine put to sleep as a whole has not waited
+                since_s = now_s
+                if waited_s > ANSWER_S:
                     raise FlightError(
                         f"lockstep: no answer to the barrier of {1e-6 * self.sim.t_us:.3f} s within {ANSWER_S:.0f} s; the flight is aborted"
                     )

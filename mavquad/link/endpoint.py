@@ -16,8 +16,26 @@ from mavquad.errors import LinkError
 Address = tuple[str, int]
 _BUFFER = 4 << 20
 _PEERS = 16  # addresses that are answered
-_SPIN = 400  # tries, about half a millisecond
+_SPIN = 500  # tries, about a millisecond
+_DOUBT, _AGAIN = 4, 64
 NOWHERE: Address = ("", 0)
+
+
+class Patience:
+    """How long to try before sleeping. Whoever mostly answers at once is cheaper waited for than slept on; but where the cores are
+    taken, trying only keeps the other side from them: after some tries in vain it is done now and then."""
+
+    def __init__(self) -> None:
+        self._vain = self._calls = 0
+
+    def tries(self) -> range:
+        """For the next wait."""
+        self._calls += 1
+        return range(_SPIN if self._vain < _DOUBT or self._calls % _AGAIN == 0 else 0)
+
+    def learn(self, came: bool) -> None:
+        """Whether it was worth it."""
+        self._vain = 0 if came else self._vain + 1
 
 
 class UdpEndpoint:
@@ -29,6 +47,7 @@ class UdpEndpoint:
         for option in (socket.SO_RCVBUF, socket.SO_SNDBUF):
             sock.setsockopt(socket.SOL_SOCKET, option, _BUFFER)
         self.fixed = peer is not None
+        self._patience = Patience()
         self.peers: list[Address] = [peer] if peer else []
 
     @property
@@ -45,12 +64,15 @@ class UdpEndpoint:
     def receive(self, timeout_s: float) -> list[tuple[bytes, Address]]:
         """All datagrams that wait, after at most timeout_s for the first. A long wait (lockstep) begins with a short spin."""
         got: list[tuple[bytes, Address]] = []
-        for _ in range(_SPIN if timeout_s >= 0.2 else 0):  # the peer mostly answers at once: cheaper than to sleep and be woken
+        tries = self._patience.tries() if timeout_s >= 0.2 else range(0)
+        for _ in tries:
             try:
                 got.append(self._first())
                 break
             except (BlockingIOError, InterruptedError, ConnectionRefusedError):
                 continue
+        if tries:
+            self._patience.learn(bool(got))
         if not got and not select.select([self.sock], [], [], max(0.0, timeout_s))[0]:
             return []
         while len(got) < 256:
