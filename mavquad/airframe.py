@@ -1,5 +1,6 @@
 """Airframes: plain numbers of one vehicle, read from `airframes/*.toml`. Each side computes its own mixer from them."""
 
+import functools
 import math
 from pathlib import Path
 from typing import Literal
@@ -145,6 +146,12 @@ def load(name_or_path: str, overrides: tuple[str, ...] = ()) -> Airframe:
         if not path.is_file():
             known = ", ".join(sorted(p.stem for p in FOLDER.glob("*.toml")))
             raise ConfigError(f"no airframe is called {name_or_path!r}; known: {known}; or give a path that ends in .toml")
+    return _loaded(path, path.stat().st_mtime_ns if path.is_file() else 0, tuple(overrides))
+
+
+@functools.lru_cache(maxsize=64)
+def _loaded(path: Path, changed_ns: int, overrides: tuple[str, ...]) -> Airframe:
+    """Once per file and changes, until the file changes: campaigns load the same few again and again."""
     data = config.read(path)
     for assignment in overrides:
         data = config.override(data, assignment)

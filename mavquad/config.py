@@ -4,6 +4,7 @@ Types are msgspec Structs declared with `class X(Section)`; their `__post_init__
 """
 
 import difflib
+import functools
 import re
 import tomllib
 from pathlib import Path
@@ -24,13 +25,19 @@ class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
 def read(path: Path) -> dict[str, Any]:
     """The plain tables of a TOML file. Raises ConfigError where it is missing or is no TOML."""
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return _copy(_parsed(path, path.stat().st_mtime_ns))
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot be read: {error}") from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
+
+
+@functools.lru_cache(maxsize=64)
+def _parsed(path: Path, changed_ns: int) -> dict[str, Any]:
+    """A file is parsed once, until it changes: a campaign reads the same few ten thousand times."""
+    return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
 def convert(data: dict[str, Any], kind: type[T], source: str) -> T:
@@ -89,7 +96,7 @@ def value(text: str) -> Any:
 def _copy(data: Any) -> Any:
     if isinstance(data, dict):
         return {k: _copy(v) for k, v in data.items()}
-    return list(data) if isinstance(data, list) else data
+    return [_copy(item) for item in data] if isinstance(data, list) else data
 
 
 def _nearest(key: str, names: Any) -> str:

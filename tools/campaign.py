@@ -66,11 +66,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _engine(args: argparse.Namespace) -> Any:
-    from tools.campaigns import over_udp
+    from tools.campaigns import compiled, over_udp
 
-    if not args.over_udp:
-        raise ConfigError("campaign: give --over-udp; flights inside one compiled function are not there yet")
-    return over_udp
+    return over_udp if args.over_udp else compiled
 
 
 def _fly(engine: Any, todo: list[Flight], store: Any, progress: "Progress", args: argparse.Namespace, out: Path) -> None:
@@ -78,14 +76,13 @@ def _fly(engine: Any, todo: list[Flight], store: Any, progress: "Progress", args
 
     engine.prepare(todo, progress.say)
     runs = str(out.with_name(out.name + ".runs"))
-    chunks = [todo[i : i + engine.CHUNK] for i in range(0, len(todo), engine.CHUNK)]
 
     def arguments(chunk: list[Flight]) -> tuple[Any, ...]:
         return [flight.words for flight in chunk], [flight.id for flight in chunk], runs, args.keep
 
     progress.begin()
     try:
-        for chunk, results in workers.run(engine.fly_chunk, chunks, arguments, args.jobs):
+        for chunk, results in workers.run(engine.fly_chunk, engine.chunks(todo), arguments, args.jobs, engine.PROCESSES):
             store.add(engine.NAME, zip(chunk, results, strict=True))
             progress.flown(chunk, results)
     except KeyboardInterrupt:

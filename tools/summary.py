@@ -66,7 +66,7 @@ def summarise(run: Path, name: str, resolved: Resolved, flown: Flown, command: s
     }
     failures = failures or _failures(result, resolved, lockstep)
     result.update(ok=not failures, failures=failures)
-    result = _finite(result)
+    result = finite(result)
     (run / "summary.json").write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     return result
 
@@ -128,11 +128,12 @@ def _per_period(sitl: dict[str, Any]) -> dict[str, float] | None:
     return {"sent": sitl["messages_received"] / periods, "received": sitl["messages_sent"] / periods}
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """The same with None for every number that is none."""
     if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
+        return {k: finite(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
+        return [finite(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -12,7 +12,7 @@ from tools.campaigns.grid import Flight
 from tools.campaigns.store import Result
 
 NAME = "udp"
-CHUNK = 1  # flights handed to a worker at once
+PROCESSES = True  # a worker ends its two programs however the campaign ends
 
 
 @functools.cache
@@ -38,6 +38,11 @@ def prepare(flights: list[Flight], say: Any) -> None:
         plan.build(resolved.companion)
     for resolved in found:
         warm.ensure(f"flight {fly.stages(resolved.companion)}", functools.partial(warm.flight, resolved), say)
+
+
+def chunks(flights: list[Flight]) -> list[list[Flight]]:
+    """What is handed to a worker at once: one flight."""
+    return [[flight] for flight in flights]
 
 
 def fly_chunk(words: list[tuple[str, ...]], ids: list[str], runs: str, keep: str) -> list[Result]:

@@ -21,9 +21,21 @@ _busy = False  # in a worker
 
 
 def run(
-    function: Callable[..., _B], chunks: Sequence[_A], arguments: Callable[[_A], tuple[Any, ...]], jobs: int
+    function: Callable[..., _B],
+    chunks: Sequence[_A],
+    arguments: Callable[[_A], tuple[Any, ...]],
+    jobs: int,
+    processes: bool = True,
 ) -> Iterator[tuple[_A, _B]]:
-    """(chunk, function(*arguments(chunk))) as they end. Raises FlightError where a chunk kills its worker every time."""
+    """(chunk, function(*arguments(chunk))) as they end; one job needs a process of its own only where `processes` says so.
+
+    Raises FlightError where a chunk kills its worker every time.
+    """
+    if jobs == 1 and not processes:
+        yield from ((chunk, function(*arguments(chunk))) for chunk in chunks)
+        return
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):  # the cores are taken by the workers themselves
+        os.environ.setdefault(name, "1")
     context = multiprocessing.get_context("spawn")
     todo, tries = deque(chunks), dict.fromkeys(range(len(chunks)), 0)
     number = {id(chunk): i for i, chunk in enumerate(chunks)}
