@@ -3,6 +3,8 @@
 import math
 from typing import TYPE_CHECKING, Any
 
+from mavquad import paths
+from mavquad.lifecycle import ENGAGED
 from mavquad.signals import Command, Demand, Estimate
 
 if TYPE_CHECKING:
@@ -95,11 +97,15 @@ def trace_row(
 
 
 def estimates(plan: "Plan", f: "Flight") -> tuple["Send", ...]:
-    """Disturbance, bounds, observed rates: at publish_hz, within about a hundred bytes each."""
+    """Disturbance, bounds, observed rates, distance from the path: at publish_hz, within about a hundred bytes each."""
     e = f.estimate
     if e is None or not f.now_us:
         return ()
     sends: list[Send] = []
+    if f.life.state == ENGAGED and all(map(math.isfinite, e.p_ned_m)):
+        wanted = paths.demand(plan.path, f.path_t0_us, f.anchor_p_m, f.anchor_yaw_rad, e.t_us).p_ned_m
+        ms = (f.now_us // 1000) & 0xFFFFFFFF
+        sends.append(("NAMED_VALUE_FLOAT", (ms, "path_err", math.dist(e.p_ned_m, wanted))))
     values = [*e.f_ned_m_s2, *e.tau_rad_s2, f.delay_s, f.hover_thrust]
     if all(math.isfinite(x) for x in e.f_ned_m_s2):
         sends.append(("DEBUG_FLOAT_ARRAY", (f.now_us, "disturb", 2, _padded(values))))

@@ -18,6 +18,7 @@ AUTOPILOT, COMPANION = 1, 191
 SAMPLE_US = 250_000  # of the histories
 HISTORY = 240  # samples: one minute
 LOST_US = 2_000_000  # without a HEARTBEAT for so long a vehicle is lost
+_FRESH_MS = 2000  # what a companion said longer ago is no news
 _CLOCK_BACK_MS = 2_000  # a boot clock that goes back further has started again
 _SAME = 1e-5  # of quaternion components: this echo is that setpoint
 
@@ -281,7 +282,7 @@ def _array(watch: Watch, t_us: int, frame: Frame, message: Any) -> None:
 def _named(watch: Watch, t_us: int, frame: Frame, message: Any) -> None:
     vehicle = watch.vehicles.get(frame.system)
     if vehicle is not None:
-        vehicle.named[message.name] = (t_us, message.value)
+        vehicle.named[message.name] = (message.time_boot_ms, message.value)
 
 
 _HANDLERS = {
@@ -346,8 +347,9 @@ def euler_deg(q_wxyz: tuple[float, ...]) -> tuple[float, float, float]:
 
 def path_error_m(vehicle: Vehicle) -> float:
     """Distance to where the vehicle should be: the companion's own figure, else to the autopilot's position target; NaN: unknown."""
-    if "path_err" in vehicle.named:
-        return vehicle.named["path_err"][1]
+    said_ms, error_m = vehicle.named.get("path_err", (0, math.nan))
+    if said_ms and abs(vehicle.boot_ms - said_ms) < _FRESH_MS:
+        return error_m
     here, there = vehicle.message("LOCAL_POSITION_NED"), vehicle.message("POSITION_TARGET_LOCAL_NED")
     if here is None or there is None or there.type_mask & 7:
         return math.nan

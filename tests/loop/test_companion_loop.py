@@ -90,6 +90,23 @@ def test_engaging_does_not_bump():
     assert max(level(m.q) for _, m in loop.autopilot.setpoints) < math.radians(3.0)
 
 
+def test_the_distance_from_the_path_is_published_while_it_is_flown():
+    loop = Loop(Companion(path=Path(name="circle"), observers=()))
+    loop.engage()
+    loop.run(4.0)
+    sent = [m for _, raw in loop.records for _, m in wire.parse(raw) if type(m).__name__ == "NAMED_VALUE_FLOAT"]
+    errors = {m.time_boot_ms: m.value for m in sent if m.name == "path_err"}
+    names, compared = loop.plan.trace_names, 0
+    at, p, ref = (names.index(name) for name in ("t_us", "p_n", "ref_p_n"))
+    for row in loop.trace:
+        if round(row[at] / 1000) in errors and row[names.index("state")] == lifecycle.STATES.index(lifecycle.ENGAGED):
+            expected = math.dist(row[p : p + 3], row[ref : ref + 3])
+            assert errors[round(row[at] / 1000)] == pytest.approx(expected, abs=1e-6)
+            compared += 1
+    assert compared > 5
+    assert 15 <= len(errors) <= 22  # five a second, none before it was engaged
+
+
 def test_denied_rates_are_stepped_down():
     loop = Loop()
     loop.autopilot.denied_above_hz = 120.0

@@ -57,6 +57,19 @@ def test_the_flight_is_shown_as_it_was(whole):
     assert "armed" in said
 
 
+def test_the_companions_own_path_error_counts_while_it_is_fresh():
+    watch = watched(6.0)
+    vehicle = watch.vehicles[1]
+
+    def say(ms, value):
+        raw = wire.encode("NAMED_VALUE_FLOAT", (ms, "path_err", value), seq=0, system=1, component=191)
+        watch.take(flown.EPOCH_US + 6_000_000, wire.split(raw)[0][0])
+        return path_error_m(vehicle)
+
+    assert say(int(vehicle.boot_ms), 0.0625) == 0.0625
+    assert say(int(vehicle.boot_ms) - 5000, 0.125) == pytest.approx(0.25)  # the autopilot's own target again
+
+
 def test_lost_frames_are_counted_by_sender():
     watch = watched(drop=lambda k, raw: k % 10 == 3)
     lost = 1.0 - watch.frames / sum(1 for _ in flown.frames())
