@@ -2,13 +2,13 @@
 
 import math
 
-from mavquad import lifecycle, outbox, paths, publish
+from mavquad import following, lifecycle, outbox, paths, publish
 from mavquad.flight import Flight, vehicle_now_us
 from mavquad.lifecycle import ENGAGED, STREAMING
 from mavquad.link import signals as decode
 from mavquad.plan import Plan
 from mavquad.setpoint import attitude, limits
-from mavquad.signals import NAN3, ZERO3, Applied, Command, Demand, Setpoint, Vec3
+from mavquad.signals import NAN3, ZERO3, Applied, Command, Demand, Quat, Setpoint, Vec3
 
 G_M_S2 = attitude.G_M_S2
 _OVER_US = 1_000_000  # after the end of the path, before landing
@@ -69,6 +69,7 @@ def step(plan: Plan, f: Flight, t_us: int, dt_s: float) -> None:
         else:
             bits = _put(plan, f, _setpoint(plan, f, command), dt_s)
             _say_which_loop(plan, f, command)
+            _watch(plan, f, t_us, estimate.q_wxyz)
         if f.life.state == ENGAGED and t_us >= f.path_t0_us + round(1e6 * plan.path.duration_s) + _OVER_US:
             f.life = f.life._replace(ended=True)
     f.trace.append(publish.trace_row(plan, f, t_us, estimate, demand, nominal, command, bits))
@@ -99,6 +100,19 @@ def _say_which_loop(plan: Plan, f: Flight, command: Command) -> None:
         f.own_attitude_loop = ours
         words = "attitude loop closed here" if ours else f"delay {1e3 * f.delay_s:.0f} ms: autopilot's attitude loop"
         outbox.say(plan, f, f"{words}", 6 if ours else 4)
+
+
+def _watch(plan: Plan, f: Flight, t_us: int, q_wxyz: Quat) -> None:
+    """Say within a second when an autopilot in our mode does not fly what is sent, and when it does again."""
+    if f.life.state != ENGAGED or f.sent is None:
+        f.following = following.START
+        return
+    follows = f.following.follows
+    f.following = following.step(plan.airframe.attitude, f.following, t_us, f.sent.q_wxyz, q_wxyz, f.delay_s)
+    if f.following.follows != follows:
+        outbox.say(plan, f, "setpoints are not followed" if follows else "setpoints are followed again", 4 if follows else 6)
+        if follows:
+            outbox.count(f, "not followed")
 
 
 def _unrotate(q: tuple[float, float, float, float], w: Vec3) -> Vec3:

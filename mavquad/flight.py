@@ -4,7 +4,7 @@ import difflib
 import math
 from typing import Any
 
-from mavquad import lifecycle, wire
+from mavquad import following, lifecycle, wire
 from mavquad.errors import ConfigError
 from mavquad.lifecycle import Life
 from mavquad.plan import Plan
@@ -58,6 +58,7 @@ class Flight:
     catching_up: bool  # this sample is old and newer ones wait behind it: not worth a setpoint
     skipped_s: float  # vehicle time that such samples took
     put_us: int  # arrival time of the last control step
+    following: following.State  # whether the vehicle does what is sent
     slow: int  # which of the slower designs we fly with; 0: none
     late_us: int  # since when we are late; 0: punctual
     interventions: int
@@ -123,6 +124,7 @@ def forget(plan: Plan, f: Flight) -> None:
     f.sent, f.echo, f.applied_thrust_m_s2 = None, None, G_M_S2
     f.lateness_us, f.late_us = 1 << 62, 0
     f.late_s, f.slow, f.catching_up, f.skipped_s, f.put_us = 0.0, 0, False, 0.0, 0
+    f.following = following.START
 
 
 def vehicle_now_us(f: Flight) -> int:

@@ -1,0 +1,80 @@
+"""Whether the vehicle does what is sent: an autopilot may ignore setpoints without a word. Pure.
+
+The thrust axis that was sent, delayed and through the airframe's attitude response, against the one measured. What an autopilot's own
+loops leave between the two is small and short, in gusts too; where they part by more for longer, nobody flies our setpoints.
+"""
+
+import math
+from typing import NamedTuple
+
+from mavquad.airframe import AttitudeResponse
+from mavquad.jit import kernel
+from mavquad.signals import Quat
+
+PART_RAD = math.radians(2.5)  # further apart than this ...
+SHARE = 0.25  # ... and than this share of what the two have leant, and than a turn during the delay ...
+FOR_S = 0.3  # ... for so long and the delay: not followed
+AGAIN_S = 1.0  # together for so long: followed again
+_KEPT_US = 400_000
+
+
+class State(NamedTuple):
+    sent: tuple[tuple[int, float, float], ...]  # vehicle time, thrust axis north and east
+    axis: tuple[float, float]  # expected
+    rate: tuple[float, float]
+    t_us: int
+    apart_s: float
+    together_s: float
+    follows: bool
+
+
+START = State((), (0.0, 0.0), (0.0, 0.0), 0, 0.0, 0.0, True)
+
+
+@kernel
+def axis(q: Quat) -> tuple[float, float]:
+    """North and east part of the body's z axis in the world, turned up: where the thrust leans."""
+    w, x, y, z = q
+    return (-2.0 * (x * z + w * y), -2.0 * (y * z - w * x))
+
+
+@kernel
+def answer(
+    wn: float, zeta: float, x: tuple[float, float], v: tuple[float, float], u: tuple[float, float], dt_s: float
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """A second-order response over dt, in steps it can take."""
+    n = int(dt_s / 0.01) + 1
+    h = dt_s / n
+    x0, x1, v0, v1 = x[0], x[1], v[0], v[1]
+    for _ in range(n):
+        v0 += h * (wn * wn * (u[0] - x0) - 2.0 * zeta * wn * v0)
+        v1 += h * (wn * wn * (u[1] - x1) - 2.0 * zeta * wn * v1)
+        x0 += h * v0
+        x1 += h * v1
+    return (x0, x1), (v0, v1)
+
+
+def step(response: AttitudeResponse, state: State, t_us: int, sent: Quat, measured: Quat, delay_s: float) -> State:
+    """After a control step at t_us that sent an attitude; delay_s from here to the autopilot and back into telemetry."""
+    now = axis(measured)
+    dt_s = 1e-6 * (t_us - state.t_us)
+    if not state.t_us or not 0.0 < dt_s < 0.5:  # the beginning, or a gap: nothing is known of what happened in it
+        return START._replace(sent=((t_us, *axis(sent)),), axis=now, t_us=t_us, follows=state.follows)
+    acts_us = t_us - round(1e6 * (response.delay_s + delay_s))
+    kept = (*[s for s in state.sent if s[0] > t_us - _KEPT_US], (t_us, *axis(sent)))
+    acting = kept[0]
+    for entry in kept:
+        if entry[0] > acts_us:
+            break
+        acting = entry
+    x, v = answer(response.natural_frequency_rad_s, response.damping, state.axis, state.rate, acting[1:], dt_s)
+    apart = math.hypot(now[0] - x[0], now[1] - x[1])
+    most = max(PART_RAD, SHARE * max(math.hypot(*x), math.hypot(*now)), delay_s * math.hypot(*v))
+    apart_s = state.apart_s + dt_s if apart > most else 0.0
+    together_s = state.together_s + dt_s if apart <= most else 0.0
+    follows = state.follows
+    if apart_s > FOR_S + delay_s:
+        follows = False
+    elif together_s > AGAIN_S:
+        follows = True
+    return State(kept, x, v, t_us, apart_s, together_s, follows)
