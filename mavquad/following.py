@@ -11,10 +11,15 @@ from mavquad.airframe import AttitudeResponse
 from mavquad.jit import kernel
 from mavquad.signals import Quat
 
-PART_RAD = math.radians(2.5)  # further apart than this ...
-SHARE = 0.25  # ... and than this share of what the two have leant, and than a turn during the delay ...
-FOR_S = 0.3  # ... for so long and the delay: not followed
+LEAST_RAD = math.radians(1.2)  # apart is more than this,
+MANY = 3.0  # more than so many times what the two part by as a rule,
+SHARE = 0.15  # more than this share of the lean, and than a turn during the delay
+FOR_S = 0.2  # apart by twice that for so long and the delay: not followed; by more sooner
 AGAIN_S = 1.0  # together for so long: followed again
+_RULE_RAD, _RULE_S = (
+    math.radians(0.8),
+    8.0,
+)  # what they part by as a rule, before anything is known and over how long it is learnt
 _KEPT_US = 400_000
 
 
@@ -23,12 +28,13 @@ class State(NamedTuple):
     axis: tuple[float, float]  # expected
     rate: tuple[float, float]
     t_us: int
-    apart_s: float
+    rule_rad: float  # root mean square of what they part by
+    apart_s: float  # weighed by how far
     together_s: float
     follows: bool
 
 
-START = State((), (0.0, 0.0), (0.0, 0.0), 0, 0.0, 0.0, True)
+START = State((), (0.0, 0.0), (0.0, 0.0), 0, _RULE_RAD, 0.0, 0.0, True)
 
 
 @kernel
@@ -59,7 +65,7 @@ def step(response: AttitudeResponse, state: State, t_us: int, sent: Quat, measur
     now = axis(measured)
     dt_s = 1e-6 * (t_us - state.t_us)
     if not state.t_us or not 0.0 < dt_s < 0.5:  # the beginning, or a gap: nothing is known of what happened in it
-        return START._replace(sent=((t_us, *axis(sent)),), axis=now, t_us=t_us, follows=state.follows)
+        return START._replace(sent=((t_us, *axis(sent)),), axis=now, t_us=t_us, rule_rad=state.rule_rad, follows=state.follows)
     acts_us = t_us - round(1e6 * (response.delay_s + delay_s))
     kept = (*[s for s in state.sent if s[0] > t_us - _KEPT_US], (t_us, *axis(sent)))
     acting = kept[0]
@@ -69,12 +75,14 @@ def step(response: AttitudeResponse, state: State, t_us: int, sent: Quat, measur
         acting = entry
     x, v = answer(response.natural_frequency_rad_s, response.damping, state.axis, state.rate, acting[1:], dt_s)
     apart = math.hypot(now[0] - x[0], now[1] - x[1])
-    most = max(PART_RAD, SHARE * max(math.hypot(*x), math.hypot(*now)), delay_s * math.hypot(*v))
-    apart_s = state.apart_s + dt_s if apart > most else 0.0
+    lean = max(math.hypot(x[0], x[1]), math.hypot(now[0], now[1]))
+    most = max(LEAST_RAD, MANY * state.rule_rad, SHARE * lean, delay_s * math.hypot(v[0], v[1]))
+    rule = math.sqrt(state.rule_rad**2 + dt_s / _RULE_S * (min(apart, most) ** 2 - state.rule_rad**2))
+    apart_s = max(0.0, state.apart_s + dt_s * (min(apart / most, 4.0) - 1.0))
     together_s = state.together_s + dt_s if apart <= most else 0.0
     follows = state.follows
-    if apart_s > FOR_S + delay_s:
+    if together_s > AGAIN_S:
+        follows, apart_s = True, 0.0
+    elif apart_s > FOR_S + delay_s:
         follows = False
-    elif together_s > AGAIN_S:
-        follows = True
-    return State(kept, x, v, t_us, apart_s, together_s, follows)
+    return State(kept, x, v, t_us, rule, apart_s, together_s, follows)
