@@ -5,7 +5,7 @@ CLIENTS := .venv-clients
 STAMP := .venv/.installed
 SCENARIO ?= gusty
 
-.PHONY: fly test test-page long install test-clients lint clean
+.PHONY: fly test test-page long mutate install test-clients lint clean
 
 fly: install
 	@$(BIN)/mavquad versus $(SCENARIO)
@@ -46,6 +46,9 @@ $(CLIENTS)/.installed: requirements-clients.txt tests/clients/programs/package-l
 	@if command -v npm > /dev/null; then cd $(CLIENTS)/node && npm ci --silent --ignore-scripts --no-audit --no-fund; \
 	 else echo "no npm: node-mavlink is left out"; fi
 	@touch $@
+
+mutate: install  # every sign of the observer turned around, one at a time: the fast tests must notice (an hour of CPU)
+	NUMBA_DISABLE_JIT=1 $(BIN)/python tests/mutate.py
 
 clean:
 	rm -rf .venv $(CLIENTS) build *.egg-info

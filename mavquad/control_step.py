@@ -55,7 +55,8 @@ def step(plan: Plan, f: Flight, t_us: int, dt_s: float) -> None:
         )
         command = nominal
         if hasattr(plan.controller.module, "messages"):  # a controller with something to say beside its setpoint
-            outbox.send_all(plan, f, plan.controller.module.messages(before, f.controller, t_us))
+            module, gains = plan.controller.module, plan.controller.gains
+            outbox.send_all(plan, f, module.messages(gains, before, f.controller, t_us, f.life.target))
     if plan.compensator is not None:
         f.compensator, corrected = plan.compensator.module.step(
             plan.compensator.gains, f.compensator, estimate, nominal, applied, t_us

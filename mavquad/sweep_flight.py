@@ -1,7 +1,7 @@
-"""A controller that sweeps the attitude setpoint for identification: a slow position hold below, the excitation on top of it.
+"""A controller that excites for identification, above a slow position hold: a multirotor's attitude setpoint, a helicopter's sticks.
 
 One axis after the other: quiet, sweep, quiet; then doublets on both axes for a check that no fit has seen. The excitation goes on
-the log beside the setpoint (DEBUG_VECT "EXCITE"), both on the vehicle's clock.
+the log beside the setpoint (DEBUG_VECT "EXCITE"), both on the vehicle's clock. A helicopter's sticks: stick_sweep.
 
 Source: identification note, section 7 (Song et al. 2011, paper 004, section 4.2).
 
@@ -16,7 +16,7 @@ import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from mavquad import quat
+from mavquad import quat, stick_sweep
 from mavquad.airframe import Airframe
 from mavquad.control import pid
 from mavquad.errors import ConfigError
@@ -42,6 +42,12 @@ class Params:
     sweep_s: float = 70.0
     quiet_s: float = 3.0
     check_s: float = 25.0  # of doublets on roll and pitch at the end; 0: none
+    stick_amplitude: tuple[float, float, float, float] = (0.12, 0.2, 0.1, 0.1)  # helicopter: lat, lon, ped, col of full stick
+    stick_f_start_hz: float = 0.05
+    stick_f_end_hz: float = 8.0
+    stick_sweep_s: float = 90.0
+    stick_quiet_s: float = 5.0
+    stick_records: int = 2  # sweeps of each stick
     hold_rad_s: float = 0.5
     tilt_max_deg: float = 25.0
     speed_max_m_s: float = 5.0
@@ -63,7 +69,13 @@ class Params:
         for limit in (self.speed_max_m_s, self.height_loss_m, self.link_age_s):
             if not limit > 0.0:
                 raise ConfigError(f"sweep: speed_max_m_s, height_loss_m, link_age_s must be > 0, got {limit}")
+        if len(self.stick_amplitude) != 4 or not all(0.0 < x <= 0.5 for x in self.stick_amplitude) or self.stick_records < 1:
+            raise ConfigError(
+                f"sweep: stick_amplitude = {list(self.stick_amplitude)}, stick_records = {self.stick_records}: expected four of"
+                " (0, 0.5] and at least 1"
+            )
         _sweep(self, self.axes[0])
+        excitation.check_rate(_stick_sweep(self), stick_sweep.PERIOD_S)
 
 
 class Gains(NamedTuple):
@@ -77,12 +89,13 @@ class Gains(NamedTuple):
     height_loss_m: float
     link_age_s: float
     g_over_hover_m_s2: float  # specific thrust per collective
+    sticks: stick_sweep.Program | None  # of a helicopter; None: the attitude setpoint is swept
 
 
 class State(NamedTuple):
     hold: pid.State
     t_s: float  # since the first step
-    excited: tuple[float, float, float, float]  # roll, pitch, yaw [rad], collective: as added in this step
+    excited: tuple[float, float, float, float]  # roll, pitch, yaw [rad], collective; or sticks: as added in this step
     aborted: int  # index of WHY; 0: not
 
 
@@ -99,6 +112,7 @@ def gains(params: Params, airframe: Airframe) -> Gains:
         params.height_loss_m,
         params.link_age_s,
         G_M_S2 / airframe.hover_thrust,
+        _program(params) if airframe.kind == "helicopter" else None,
     )
 
 
@@ -106,8 +120,10 @@ def init(gains: Gains) -> State:
     return State(pid.init(gains.hold), 0.0, (0.0, 0.0, 0.0, 0.0), 0)
 
 
-def duration_s(params: Params) -> float:
-    """How long the whole sequence takes."""
+def duration_s(params: Params, kind: str = "quadrotor") -> float:
+    """How long the whole sequence takes on this kind of vehicle."""
+    if kind == "helicopter":
+        return LEAD_S + stick_sweep.PERIOD_S * len(_program(params))
     return LEAD_S + sum(_sweep(params, axis).total_s for axis in params.axes) + params.check_s
 
 
@@ -116,6 +132,8 @@ def step(gains: Gains, state: State, estimate: Estimate, demand: Demand, preview
     hold, command = pid.step(gains.hold, state.hold, estimate, demand, preview, dt_s)
     aborted = state.aborted or _abort(gains, estimate, demand, dt_s)
     excited = (0.0, 0.0, 0.0, 0.0) if aborted else excitation_at(gains, state.t_s)
+    if gains.sticks is not None:
+        return State(hold, state.t_s + dt_s, excited, aborted), command
     roll, pitch, yaw, collective = excited
     right, ahead = G_M_S2 * math.tan(roll), -G_M_S2 * math.tan(pitch)
     heading = demand.yaw_rad + yaw
@@ -126,7 +144,9 @@ def step(gains: Gains, state: State, estimate: Estimate, demand: Demand, preview
 
 
 def excitation_at(gains: Gains, t_s: float) -> tuple[float, float, float, float]:
-    """(roll, pitch, yaw [rad], collective) of the sequence at `t_s`."""
+    """(roll, pitch, yaw [rad], collective) of the sequence at `t_s`; of a helicopter its sticks (lat, lon, ped, col)."""
+    if gains.sticks is not None:
+        return stick_sweep.at(gains.sticks, t_s - LEAD_S)
     found = [0.0, 0.0, 0.0, 0.0]
     at = t_s - LEAD_S
     for axis, sweep in zip(gains.axes, gains.sweeps, strict=True):
@@ -139,10 +159,17 @@ def excitation_at(gains: Gains, t_s: float) -> tuple[float, float, float, float]
     return (found[0], found[1], found[2], found[3])
 
 
-def messages(before: State, after: State, t_us: int) -> tuple[tuple[str, tuple[Any, ...]], ...]:
-    """What goes on the wire beside the setpoint: the excitation at every step, and why it ended."""
+def messages(
+    gains: Gains, before: State, after: State, t_us: int, target: tuple[int, int]
+) -> tuple[tuple[str, tuple[Any, ...]], ...]:
+    """What goes on the wire to `target` beside the setpoint: the excitation at every step, and why it ended."""
     roll, pitch, yaw, collective = after.excited
-    sends: list[tuple[str, tuple[Any, ...]]] = [("DEBUG_VECT", ("EXCITE", t_us, roll, pitch, yaw or collective))]
+    sends: list[tuple[str, tuple[Any, ...]]]
+    if gains.sticks is not None:
+        controls = (*after.excited, 0.0, 0.0, 0.0, 0.0)
+        sends = [("SET_ACTUATOR_CONTROL_TARGET", (t_us, stick_sweep.PASSTHROUGH, *target, controls))]
+    else:
+        sends = [("DEBUG_VECT", ("EXCITE", t_us, roll, pitch, yaw or collective))]
     if after.aborted and not before.aborted:
         sends.append(("STATUSTEXT", (4, f"mavquad: sweep aborted: {WHY[after.aborted]}"[:50], 0, 0)))
     return tuple(sends)
@@ -175,3 +202,17 @@ def _sweep(params: Params, axis: str) -> Sweep:
         quiet_s=params.quiet_s,
         fade_s=2.0,
     )
+
+
+def _stick_sweep(params: Params) -> Sweep:
+    return Sweep(
+        amplitude=max(params.stick_amplitude),
+        f_start_hz=params.stick_f_start_hz,
+        f_end_hz=params.stick_f_end_hz,
+        duration_s=params.stick_sweep_s,
+        quiet_s=params.stick_quiet_s,
+    )
+
+
+def _program(params: Params) -> stick_sweep.Program:
+    return stick_sweep.program(params.axes, params.stick_amplitude, _stick_sweep(params), params.stick_records, params.check_s)

@@ -35,7 +35,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--controller", help="pd, pid, adrc, iadrc, eskf-mpc, or autopilot (its own position loop)")
     parser.add_argument(
-        "--axis", action="append", choices=("roll", "pitch", "yaw", "thrust"), help="of the scenario `sweep`; again for more"
+        "--axis",
+        action="append",
+        choices=("roll", "pitch", "yaw", "thrust"),
+        help="of the scenario `sweep` (a helicopter's stick); again for more",
     )
     parser.add_argument("--estimator", help="what feeds the controller (default: the controller's own)")
     parser.add_argument("--compensator", help="none or asmf")
@@ -93,17 +96,23 @@ def one(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     return result
 
 
-def _axes(args: argparse.Namespace) -> list[str]:
-    """--axis as changes of the scenario: which axes are swept, and a path as long as that takes."""
-    if not args.axis:
-        return []
+def _changes(args: argparse.Namespace) -> list[str]:
+    """What is changed of the scenario. A sweep's path lasts as long as its program of these axes on this vehicle."""
     if args.scenario != "sweep":
-        raise FlightError(f"--axis is for the scenario sweep; {args.scenario} is flown as its path says")
-    from mavquad import sweep_flight
+        if args.axis:
+            raise FlightError(f"--axis is for the scenario sweep; {args.scenario} is flown as its path says")
+        return list(args.set)
+    from mavquad import airframe, plan, sweep_flight
+    from tools import scenarios
 
-    axes = tuple(dict.fromkeys(args.axis))
-    seconds = sweep_flight.duration_s(sweep_flight.Params(axes=axes))
-    return [f"sweep.axes={json.dumps(axes)}", f"path.duration_s={seconds + 3.0:.0f}"]
+    axes = [f"sweep.axes={json.dumps(tuple(dict.fromkeys(args.axis)))}"] if args.axis else []
+    tune = scenarios.load(args.scenario, [*args.set, *axes]).companion.get("tune", {}).get("sweep", {})
+    kind = airframe.load(args.airframe).kind
+    seconds = sweep_flight.duration_s(plan.params("sweep", sweep_flight, tune), kind)
+    changes = [*axes, f"path.duration_s={seconds + 3.0:.0f}", f"flight.max_time_s={seconds + 210.0:.0f}"]
+    if kind == "helicopter":  # what it made of the sticks, its inner loop's share included
+        changes += ["companion.link.rates_hz.ACTUATOR_CONTROL_TARGET=250.0", "flight.takeoff_m=20"]
+    return [*changes, *args.set]
 
 
 def resolve(args: argparse.Namespace) -> Any:
@@ -122,7 +131,7 @@ def resolve(args: argparse.Namespace) -> Any:
         loop=args.loop,
         signing_key=args.signing_key,
     )
-    return scenarios.resolve(scenarios.load(args.scenario, [*args.set, *_axes(args)]), options)
+    return scenarios.resolve(scenarios.load(args.scenario, _changes(args)), options)
 
 
 def stages(companion: Any) -> str:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from mavquad.identify.noise import Noise
 from mavquad.identify.timebase import Held, Sampled
 from mavquad.identify.vehicle import Drag, GyroFilter, Thrust, Torque
 from tools.identify_log import Flight, Setpoints, sampled
+
+if TYPE_CHECKING:
+    from tools.identify_hover import Hover
 
 Span = tuple[float, float]
 AXES = ("roll", "pitch", "yaw")
@@ -75,6 +78,7 @@ class Identified(NamedTuple):
     noise: dict[str, Noise]
     missing: tuple[str, ...]  # what cannot be identified from this log, and what to record
     notes: tuple[str, ...]
+    hover: tuple["Hover", ...] = ()  # of a helicopter whose sticks were swept
 
     def of(self, source: str) -> list[Response]:
         return [r for r in self.responses if r.source == source]
@@ -107,9 +111,21 @@ def identify(flight: Flight, fit_s: Span | None = None, check_s: Span | None = N
         if (turned := _try(missing, f"torque per command, {axis}", partial(_torque, flight, i, spans))) is not None:
             torque[axis] = turned
     notes = [*flight.notes, *_doubts(responses)]
+    hover = _hover(flight, missing)
     return Identified(
-        flight, tuple(responses), gyro, thrust, drag, torque, noises(flight), (*missing, *UNKNOWABLE), tuple(notes)
+        flight, tuple(responses), gyro, thrust, drag, torque, noises(flight), (*missing, *UNKNOWABLE), tuple(notes), hover
     )
+
+
+def _hover(flight: Flight, missing: list[str]) -> "tuple[Hover, ...]":
+    """The hover model, where somebody added to a helicopter's sticks."""
+    if flight.sticks is None:
+        return ()
+    from tools import identify_hover  # half a minute of work: only where there is something to find
+
+    found, unswept = _try(missing, "hover model", lambda: identify_hover.identify(flight)) or ([], [])
+    missing += [f"hover model, {words}" for words in unswept]
+    return tuple(found)
 
 
 def response(flight: Flight, setpoints: Setpoints, i: int, fit_s: Span | None, check_s: Span | None) -> Response:
@@ -284,6 +300,17 @@ def summary(found: Identified) -> dict[str, Any]:
             if flight.round_trip_s.size
             else None,
         },
+        "hover": [
+            {
+                "part": h.name,
+                "parameters": h.found.parameters,
+                "sd": dict(zip(h.found.structure.free, h.found.sd.tolist(), strict=True)),
+                "chi2": h.found.chi2, "J": h.found.j, "agreeing_starts": h.found.agreeing,
+                "check": None if h.check is None else {"fit_pct": h.check.fit_pct.tolist(), "tic": h.check.tic.tolist()},
+                "notes": list(h.notes),
+            }
+            for h in found.hover
+        ],
         "missing": list(found.missing),
         "notes": list(found.notes),
     }  # fmt: skip

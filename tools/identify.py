@@ -2,7 +2,7 @@
 
 Works from recordings alone, of any autopilot: the attitude response from the commands as sent (SET_ATTITUDE_TARGET) and from what the
 autopilot made of them (ATTITUDE_TARGET; on ArduCopter after its own input shaping: the inner loop only), hover thrust, drag, the gyro's
-own filter, torque per command, noise of every stream, link jitter. What this log cannot tell is said, with what to record.
+own filter, torque per command, noise of every stream, link jitter; of a helicopter whose sticks were swept the hover model. What this log cannot tell is said, with what to record.
 
 Example: mavquad identify flight.tlog --out mine.toml --report mine.html
 """
@@ -21,6 +21,7 @@ from tools.identified import Identified, Span
 
 if TYPE_CHECKING:
     from tools.calibrate import Calibration
+    from tools.identify_hover import Hover
 
 THRUST_LAG_S = 0.05  # of an airframe that says nothing of its rotors
 
@@ -57,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
             from tools import calibrate  # the filter's kernels: only where it is tried
 
             calibrations.append(calibrate.calibrate(found, base.rotors.lag_s if base.rotors else THRUST_LAG_S))
-        if not found.of("SET_ATTITUDE_TARGET") and (args.out or not args.bounds):
+        if not found.of("SET_ATTITUDE_TARGET") and not (found.hover and not args.out) and (args.out or not args.bounds):
             reasons = [m for m in found.missing if "SET_ATTITUDE_TARGET" in m]
             problems.append(f"{path}: no response from commands as sent: {reasons[0] if reasons else 'nothing was commanded'}")
     if args.json:
@@ -118,6 +119,7 @@ def text(found: Identified) -> str:
         )
     if found.responses:
         lines += ["  (+- is 2 sigma; coherence: the least from 0.2 to 4 Hz; ATTITUDE_TARGET shows the inner loop only)", ""]
+    lines += [line for h in found.hover for line in hover_text(h)]
     if found.thrust:
         t = found.thrust
         divides = "; it divides thrust by cos(tilt) itself" if t.over_cosine else ""
@@ -153,6 +155,22 @@ def text(found: Identified) -> str:
     if found.notes:
         lines += ["", "notes:"] + [f"  {n}" for n in found.notes]
     return "\n".join(lines)
+
+
+def hover_text(h: "Hover") -> list[str]:
+    """One part of a helicopter's hover model: every parameter with its bar, how it predicts, what is doubtful."""
+    f = h.found
+    lines = [f"hover model, {h.name}: chi2 {f.chi2:.2f}, J {f.j:.0f}, {f.agreeing} of {f.starts} starts agree"]
+    for name, value, sd in zip(f.structure.free, f.theta, f.sd, strict=True):
+        lines.append(f"  {name:10} {value:10.4g} +- {2.0 * sd:.2g}")
+    held = ", ".join(f"{name} = {value:.4g}" for name, value in f.structure.fixed.items())
+    lines.append(f"  held: {held}")
+    if h.check is not None:
+        fits = " ".join(
+            f"{o} {p:.0f} % (TIC {t:.2f})" for o, p, t in zip(h.structure.outputs, h.check.fit_pct, h.check.tic, strict=True)
+        )
+        lines.append(f"  doublets, 3 s ahead: {fits}")
+    return [*lines, *(f"  {note}" for note in h.notes), ""]
 
 
 def bounds_text(c: "Calibration") -> str:

@@ -13,6 +13,7 @@ from mavquad.link import recording
 from mavquad.link.columns import Log, Stream
 from mavquad.signals import Attitude, Imu, Motors, Position, Target
 
+PASSTHROUGH = 3  # group of SET_ACTUATOR_CONTROL_TARGET: on top of the autopilot's own
 IN_AIR = 2  # MAV_LANDED_STATE_IN_AIR
 Span = tuple[float, float]
 
@@ -42,6 +43,15 @@ class Vectors(NamedTuple):
     source: str
 
 
+class Sticks(NamedTuple):
+    """A helicopter's sticks -1..1 (lat, lon, ped, col): as a companion added them, and as they were applied."""
+
+    added_t_s: np.ndarray  # (n,)
+    added: np.ndarray  # (n, 4) SET_ACTUATOR_CONTROL_TARGET, group 3
+    applied_t_s: np.ndarray  # (m,)
+    applied: np.ndarray  # (m, 4) ACTUATOR_CONTROL_TARGET
+
+
 class Flight(NamedTuple):
     """One log. Times are vehicle seconds since its first message; what it does not hold is None."""
 
@@ -58,6 +68,7 @@ class Flight(NamedTuple):
     clock: Clock
     round_trip_s: np.ndarray  # (n,) TIMESYNC answers
     notes: tuple[str, ...]
+    sticks: Sticks | None = None
 
 
 def read(path: Path) -> Flight:
@@ -188,8 +199,24 @@ def _from_tlog(log: Log) -> Flight:
     flying = _flying(rows("EXTENDED_SYS_STATE"), target, attitude, clock, arrival)
     return Flight(
         log.path, len(log), float(log.t_us[-1] - start_us) * 1e-6, attitude, sent, target, imu, position, motors, flying, clock,
-        _round_trips(log), (*notes, *said),
+        _round_trips(log), (*notes, *said), _sticks(log, (system, component), own("ACTUATOR_CONTROL_TARGET", "time_usec", 1e-6), zero),
     )  # fmt: skip
+
+
+def _sticks(log: Log, vehicle: tuple[int, int], applied: tuple[Any, np.ndarray] | None, zero_s: float) -> Sticks | None:
+    """By the vehicle's stamps on both sides; None where nobody added anything."""
+    streams = [s for s in log.find("SET_ACTUATOR_CONTROL_TARGET") if (s.system, s.component) != vehicle]
+    if not streams:
+        return None
+    table = log.rows(max(streams, key=lambda s: s.messages))
+    table = table[table["group_mlx"] == PASSTHROUGH]
+    t = 1e-6 * table["time_usec"].astype(float) - zero_s
+    ahead = np.concatenate([[True], t[1:] > np.maximum.accumulate(t)[:-1]]) if len(t) else np.zeros(0, bool)
+    if ahead.sum() < 3:
+        return None
+    rows, at = applied if applied is not None else ({"controls": np.zeros((0, 8))}, np.zeros(0))
+    controls = table["controls"][:, :4].astype(float)
+    return Sticks(t[ahead], controls[ahead], at, rows["controls"][:, :4].astype(float))
 
 
 def _vehicle(log: Log) -> tuple[int, int]:

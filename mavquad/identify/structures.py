@@ -99,11 +99,11 @@ def tie(structure: Structure, name: str, of: str, ratio: float) -> Structure:
     )
 
 
-def with_delays(structure: Structure, longest_s: float = 0.1) -> Structure:
-    """The same structure with one free pure delay per input, 0..longest_s."""
+def with_delays(structure: Structure, longest_s: float = 0.1, least_s: float = 0.0) -> Structure:
+    """The same structure with one free pure delay per input, least_s..longest_s (below zero: inputs may be stamped late)."""
     names = tuple(DELAY + x for x in structure.inputs)
     return structure._replace(
-        free=structure.free + names, bounds={**structure.bounds, **{name: (0.0, longest_s) for name in names}}
+        free=structure.free + names, bounds={**structure.bounds, **{name: (least_s, longest_s) for name in names}}
     )
 
 

@@ -82,16 +82,18 @@ def test_an_abort_ends_the_excitation_in_its_own_sample_and_for_good(estimate, d
     state, _ = at(GAINS, 30.0, estimate, dt_s=dt_s)
     assert state.excited == (0.0, 0.0, 0.0, 0.0)
     before = sweep_flight.init(GAINS)
-    assert any(why in fields[1] for name, fields in sweep_flight.messages(before, state, 1) if name == "STATUSTEXT")
+    assert any(
+        why in fields[1] for name, fields in sweep_flight.messages(GAINS, before, state, 1, (1, 1)) if name == "STATUSTEXT"
+    )
     later, command = sweep_flight.step(GAINS, state, still(), wanted(), None, DT_S)
     assert later.excited == (0.0, 0.0, 0.0, 0.0)
     assert command.a_ned_m_s2[0] == pytest.approx(0.0)
-    assert len(sweep_flight.messages(state, later, 2)) == 1  # said once
+    assert len(sweep_flight.messages(GAINS, state, later, 2, (1, 1))) == 1  # said once
 
 
 def test_the_excitation_goes_on_the_log_with_the_vehicles_stamp():
     state, _ = at(GAINS, 30.0)
-    ((name, fields),) = sweep_flight.messages(sweep_flight.init(GAINS), state, 123_456)
+    ((name, fields),) = sweep_flight.messages(GAINS, sweep_flight.init(GAINS), state, 123_456, (1, 1))
     raw = wire.encode(name, fields, seq=0, system=1, component=191)
     message = wire.decode(wire.split(raw)[0][0])
     assert (message.name, message.time_usec) == ("EXCITE", 123_456)
