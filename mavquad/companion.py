@@ -404,6 +404,10 @@ class Companion:
             "delay_s": self.flight.delay_s,
             "controller": diagnose(self.flight.controller) if diagnose else {},
             "rates_hz": {r.name: r.granted_hz for r in life.rates},
+            "observer_samples": {
+                stage.label: stage.module.health(state, self.flight.now_us).counts._asdict()
+                for stage, state in zip(self.plan.observers, self.flight.observers, strict=True)
+            },
             "latency_us": {
                 "p50": latency[len(latency) // 2],
                 "p99": latency[min(len(latency) - 1, int(0.99 * len(latency)))],

@@ -97,7 +97,7 @@ def trace_row(
 
 
 def estimates(plan: "Plan", f: "Flight") -> tuple["Send", ...]:
-    """Disturbance, bounds, observed rates, distance from the path: at publish_hz, within about a hundred bytes each."""
+    """Disturbance, bounds, observed rates with their health, distance from the path: at publish_hz, within about a hundred bytes each."""
     e = f.estimate
     if e is None or not f.now_us:
         return ()
@@ -111,8 +111,8 @@ def estimates(plan: "Plan", f: "Flight") -> tuple["Send", ...]:
         sends.append(("DEBUG_FLOAT_ARRAY", (f.now_us, "disturb", 2, _padded(values))))
     if plan.observers:
         stage, state = plan.observers[0], f.observers[0]
-        q, w = stage.module.predict(stage.gains, state, f.now_us)
-        sends.append(("DEBUG_FLOAT_ARRAY", (f.now_us, "rates", 3, _padded([*w, *q]))))
+        q, w, health = stage.module.read(stage.gains, state, f.now_us)
+        sends.append(("DEBUG_FLOAT_ARRAY", (f.now_us, "rates", 3, _padded([*w, *q, *stage.module.published(health)]))))
     if plan.compensator is not None:
         sends.append(
             ("DEBUG_FLOAT_ARRAY", (f.now_us, "asmf", 4, _padded(list(plan.compensator.module.published(f.compensator)))))

@@ -9,12 +9,13 @@ from mavquad.flight import Flight, forget
 from mavquad.lifecycle import ENGAGED, OBSERVING, STREAMING
 from mavquad.link import signals as decode
 from mavquad.plan import Plan
-from mavquad.signals import Attitude, Position, Target
+from mavquad.signals import Attitude, Imu, Position, Target
 from mavquad.wire import Frame
 
 _BEHIND_US, _BEHIND_MANY = 500_000, 30  # no link delivers so many in a row so late: a clock restarted soon after it started
 _LATE_US = 2_000_000  # a stamp further back than this is a restarted clock, not a late message
 _OLD_US = 60_000  # a sample this late, right behind another, comes out of a queue
+_WITH_ATTITUDE = ("ATTITUDE_QUATERNION", "ATTITUDE")
 _DOUBLED_US = 500_000  # ATTITUDE is left out while the quaternion was heard so recently
 
 
@@ -25,6 +26,12 @@ def take(plan: Plan, f: Flight, name: str, frame: Frame) -> None:
     try:
         sample: Any = decode.DECODERS[name](wire.decode(frame))
     except LinkError:
+        outbox.count(f, f"{name} refused")
+        return
+    observed = (
+        name in _WITH_ATTITUDE and sample.omega_rad_s[0] != sample.omega_rad_s[0]
+    )  # NaN: it sends an attitude without rates
+    if observed and not plan.observers:
         outbox.count(f, f"{name} refused")
         return
     if name == "SERVO_OUTPUT_RAW":
@@ -46,19 +53,31 @@ def take(plan: Plan, f: Flight, name: str, frame: Frame) -> None:
         f.echo = sample
         _learn_hover(f, sample)
         _recognise(f, sample)
-    f.estimator = plan.estimator.module.observe(plan.estimator.gains, f.estimator, sample)
-    if plan.compensator is not None:
-        f.compensator = plan.compensator.module.observe(plan.compensator.gains, f.compensator, sample)
     if plan.observers:
         f.observers = tuple(
             [s.module.observe(s.gains, state, sample) for s, state in zip(plan.observers, f.observers, strict=True)]
         )
+    if (kind is Attitude or kind is Imu) and (observed or plan.settings.body_rates == "observer"):
+        sample = _with_observed_rates(plan, f, sample)
+    f.estimator = plan.estimator.module.observe(plan.estimator.gains, f.estimator, sample)
+    if plan.compensator is not None:
+        f.compensator = plan.compensator.module.observe(plan.compensator.gains, f.compensator, sample)
     if kind is Attitude:
         _pace(f)
         _punctual(plan, f, t_us)
         gap_us = t_us - f.control_us
         if not f.control_us or gap_us >= plan.control_us - f.control_gap_us // 2:
             control_step.step(plan, f, t_us, min(0.2, 1e-6 * gap_us) if f.control_us else 1e-6 * plan.control_us)
+
+
+def _with_observed_rates(plan: Plan, f: Flight, sample: Any) -> Any:
+    """The sample with the first observer's rates in place of a gyro's: what every estimator and controller takes them from."""
+    if "body rates observed" not in f.counts:
+        outbox.say(plan, f, f"body rates by {plan.observers[0].label.partition(':')[0]}", 5)
+    outbox.count(f, "body rates observed")
+    stage, state = plan.observers[0], f.observers[0]
+    _, w = stage.module.predict(stage.gains, state, sample.t_us)
+    return sample._replace(omega_rad_s=w) if type(sample) is Attitude else sample._replace(gyro_rad_s=w)
 
 
 def _pace(f: Flight) -> None:

@@ -58,6 +58,9 @@ class Companion(config.Section, frozen=True):
     compensator: Literal["none", "asmf"] = "none"
     observers: tuple[str, ...] = ("gsmo",)
     loop: Literal["attitude", "rates"] = "attitude"
+    body_rates: Literal["autopilot", "observer"] = (
+        "autopilot"  # what controllers get; where it sends none, the first observer's
+    )
     control_hz: float = 125.0
     takeoff_m: float = 5.0
     settle_s: float = 2.0  # engaged at the start point before the path begins
@@ -71,6 +74,8 @@ class Companion(config.Section, frozen=True):
     def __post_init__(self) -> None:
         if not 1.0 <= self.control_hz <= 1000.0:
             raise ConfigError(f"control_hz = {self.control_hz}: expected 1 to 1000")
+        if self.body_rates == "observer" and not self.observers:
+            raise ConfigError('body_rates = "observer" needs one in observers, for instance "gsmo"')
         if not 0.5 <= self.takeoff_m <= 100.0:
             raise ConfigError(f"takeoff_m = {self.takeoff_m}: expected 0.5 to 100")
         for name, hz in self.link.rates_hz.items():

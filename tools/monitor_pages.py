@@ -186,7 +186,7 @@ def estimates(watch: Watch, vehicle: Vehicle | None, size: Size) -> list[Line]:
         ours = observed[1][axis] if observed else math.nan
         past = [values[axis] for values in vehicle.history.get("rates estimate", ())]
         rows.append([name, *(number(x, "+.3f") for x in (theirs, ours, ours - theirs)), spark(past, width)])
-    lines = [*grid(rows, "lrrrl"), []]
+    lines = [*grid(rows, "lrrrl"), *_observer(observed[1] if observed else ()), []]
     if {"disturb", "asmf"} & set(vehicle.arrays):
         lines += [*_disturbance(vehicle, size), []]
         values = vehicle.arrays.get("disturb", (0, (math.nan,) * 8))[1]
@@ -201,6 +201,24 @@ def estimates(watch: Watch, vehicle: Vehicle | None, size: Size) -> list[Line]:
     if wind is not None:
         lines.append([(f"wind by the autopilot: {_wind(wind)}", "")])
     return lines
+
+
+def _observer(values: Sequence[float]) -> list[Line]:
+    """What the observed rates are worth, as a companion publishes it behind them (gsmo.published)."""
+    if len(values) < 24 or not values[14] > 0.0:
+        return []
+    age_s, _, noise_rad, _, coasting, stale, settled, accepted = values[7:15]
+    names = ("not finite", "norm", "repeated", "late", "gaps", "restarts", "lost", "torque", "stamp")
+    counted = ", ".join(f"{name} {n:.0f}" for name, n in zip(names, values[15:24], strict=True) if n > 0.0)
+    said = ("stale", BAD) if stale else ("coasting", BAD) if coasting else ("settled", GOOD) if settled else ("settling", "")
+    noise = f", noise {math.degrees(noise_rad):.2f} deg" if math.isfinite(noise_rad) else ""
+    return [
+        [
+            ("observer ", ""),
+            said,
+            (f", age {1e3 * age_s:.0f} ms{noise}, {accepted:.0f} samples; {counted or 'none refused'}", ""),
+        ]
+    ]
 
 
 def _disturbance(vehicle: Vehicle, size: Size) -> list[Line]:

@@ -240,6 +240,12 @@ def health(state: State, t_us: int) -> Health:
     return Health(counts, age_s, period_s, coasting, periods > gsmo_core.STALE_PERIODS, settled, noise_rad, member)
 
 
+def published(h: Health) -> tuple[float, ...]:
+    """The health as numbers for the wire: age, period [s], noise [rad], best member, coasting, stale, settled (0 or 1), the counts."""
+    flags = (float(h.coasting), float(h.stale), float(h.settled))
+    return (h.age_s, h.period_s, h.noise_rad, float(h.member), *flags, *(float(n) for n in h.counts))
+
+
 def run_record(
     gains: Gains,
     t_us: npt.NDArray[np.int64],

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mavquad import linalg
+from mavquad import linalg, quat
 from mavquad.estimate import gsmo_implicit, gsmo_online, gsmo_relay, gsmo_stream
 from mavquad.estimate.gsmo_online import Bank
 from mavquad.estimate.gsmo_stream import Stream
@@ -79,8 +79,7 @@ def take(gains: Fixed, core: Core, q_meas: Quat, dt_s: float) -> Core:
 @kernel
 def sane(q: Quat, w: Vec3, d: Vec3) -> bool:
     """Finite, and inside what any vehicle does."""
-    total = q[0] + q[1] + q[2] + q[3] + d[0] + d[1] + d[2]
-    return math.isfinite(total) and linalg.norm(w) <= MAX_RATE_RAD_S
+    return math.isfinite(quat.norm(q)) and linalg.finite3(d) and linalg.norm(w) <= MAX_RATE_RAD_S
 
 
 @kernel

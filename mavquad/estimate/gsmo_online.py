@@ -167,10 +167,10 @@ def rescue(bank: Bank, r: np.ndarray) -> None:
     size_m = math.sqrt(r[m, 0] ** 2 + r[m, 1] ** 2 + r[m, 2] ** 2)
     for i in range(MEMBERS):
         size = math.sqrt(r[i, 0] ** 2 + r[i, 1] ** 2 + r[i, 2] ** 2)
-        total = 0.0
+        finite = math.isfinite(size)
         for j in range(members.STATES):
-            total += bank.x[i, j]
-        if not math.isfinite(total) or not math.isfinite(size) or (size > LOST_RAD and size > 5.0 * size_m):
+            finite = finite and math.isfinite(bank.x[i, j])
+        if not finite or (size > LOST_RAD and size > 5.0 * size_m):
             for j in range(members.N):
                 bank.x[i, j] = bank.x[m, j]
             for j in range(members.N, members.STATES):

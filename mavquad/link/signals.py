@@ -34,15 +34,17 @@ def _finite(name: str, stamp: int, unit: str, *values: float) -> None:
 
 
 def attitude_quaternion(m: Any) -> Attitude:
-    """ATTITUDE_QUATERNION (#31): ms -> us; rates already rad/s in FRD."""
+    """ATTITUDE_QUATERNION (#31): ms -> us; rates already rad/s in FRD, all NaN where the sender has no gyro."""
     ms, w, x, y, z, p, q, r = m[:8]
-    _finite("ATTITUDE_QUATERNION", ms, "ms", p, q, r)
+    if not (p != p and q != q and r != r):
+        _finite("ATTITUDE_QUATERNION", ms, "ms", p, q, r)
     return Attitude(1000 * ms, _unit("ATTITUDE_QUATERNION", ms, "ms", (w, x, y, z)), (p, q, r))
 
 
 def attitude(m: Any) -> Attitude:
-    """ATTITUDE (#30): ZYX Euler angles."""
-    _finite("ATTITUDE", m.time_boot_ms, "ms", m.roll, m.pitch, m.yaw, m.rollspeed, m.pitchspeed, m.yawspeed)
+    """ATTITUDE (#30): ZYX Euler angles; rates all NaN where the sender has no gyro."""
+    rates = (m.rollspeed, m.pitchspeed, m.yawspeed)
+    _finite("ATTITUDE", m.time_boot_ms, "ms", m.roll, m.pitch, m.yaw, *(() if all(w != w for w in rates) else rates))
     cr, sr = math.cos(0.5 * m.roll), math.sin(0.5 * m.roll)
     cp, sp = math.cos(0.5 * m.pitch), math.sin(0.5 * m.pitch)
     cy, sy = math.cos(0.5 * m.yaw), math.sin(0.5 * m.yaw)
@@ -52,7 +54,7 @@ def attitude(m: Any) -> Attitude:
         cr * sp * cy + sr * cp * sy,
         cr * cp * sy - sr * sp * cy,
     )
-    return Attitude(1000 * m.time_boot_ms, q, (m.rollspeed, m.pitchspeed, m.yawspeed))
+    return Attitude(1000 * m.time_boot_ms, q, rates)
 
 
 def mocap(m: Any) -> Mocap:

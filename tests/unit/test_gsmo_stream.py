@@ -129,7 +129,8 @@ def test_the_torque_is_held_and_averaged_over_the_period():
 def test_absurd_torque_is_refused(torque):
     s = gsmo_stream.begin(gsmo_stream.init(), 0)
     assert gsmo_stream.heard_torque(s, 1_000, torque) == (False, s)
-    ints, _ = gsmo_core.torque_sample(*gsmo.init(gsmo.gains(gsmo.Params()))[:2], 1_000, torque)
+    ints, floats = gsmo.init(gsmo.gains(gsmo.Params()))[:2]
+    gsmo_core.torque_sample(ints, floats, 1_000, torque)
     assert Counts(*ints[:10].tolist()).bad_torque == 1
 
 
