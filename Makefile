@@ -48,7 +48,7 @@ $(CLIENTS)/.installed: requirements-clients.txt tests/clients/programs/package-l
 	@touch $@
 
 mutate: install  # every sign of the observer turned around, one at a time: the fast tests must notice (an hour of CPU)
-	NUMBA_DISABLE_JIT=1 $(BIN)/python tests/mutate.py
+	NUMBA_DISABLE_JIT=1 $(BIN)/python tests/observer_signs.py
 
 clean:
 	rm -rf .venv $(CLIENTS) build *.egg-info

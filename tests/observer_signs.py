@@ -3,9 +3,9 @@
 Every +, -, unary minus, += and -= of the modules below is turned around in turn, in functions and in constants, and the fast tests
 run uncompiled until the first of them fails. A mutant that outlives them all is listed, and the command ends with 1.
 
-  NUMBA_DISABLE_JIT=1 python tests/mutate.py                       every mutant (about 10 minutes)
-  NUMBA_DISABLE_JIT=1 python tests/mutate.py --every 40            a sample
-  NUMBA_DISABLE_JIT=1 python tests/mutate.py --only lie.step_1     one function or one module
+  NUMBA_DISABLE_JIT=1 python tests/observer_signs.py                       every mutant (about 10 minutes)
+  NUMBA_DISABLE_JIT=1 python tests/observer_signs.py --every 40            a sample
+  NUMBA_DISABLE_JIT=1 python tests/observer_signs.py --only lie.step_1     one function or one module
 """
 
 import argparse
