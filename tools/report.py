@@ -155,6 +155,10 @@ def _compared(m: Material) -> str:
                 rows.append(_row(other, path.parent.name))
     heads = ["compared with", "controller", "compensator", "autopilot", "seed", "rmse, m", "largest, m", "ok"]
     tables = html.table(heads, rows[:13])
+    if len(rows) == 1:
+        other = "pid" if m.result["controller"] == "autopilot" else "autopilot"
+        hint = f"No other flight of this scenario lies beside it. The same wind flown by a rival: mavquad fly {m.result['scenario']}"
+        tables += html.text(f"{hint} --seed {m.result['seed']} --controller {other}; then this report again.", "quiet")
     rates = m.result.get("rate_rmse_rad_s") or {}
     if rates:
         tables += html.table(

@@ -201,6 +201,19 @@ def test_a_log_without_position_still_gives_its_rates(tmp_path, capsys):
     assert "no position in it" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("size", [0, 7, 20, 55, 400, 1500, 2999, 8000, 30_000])
+def test_a_log_cut_anywhere_is_replayed_or_refused_in_one_line(size, tmp_path, capsys):
+    path = tmp_path / "cut.tlog"
+    path.write_bytes(SWEEP.read_bytes()[:size])
+    done = tools_main.main(["replay", str(path), "--json"])
+    out, said = capsys.readouterr()
+    assert said.count("\n") <= 1
+    if done == 0:
+        assert json.loads(out)["replay"]
+    else:
+        assert "cut.tlog" in said
+
+
 # ---- the smoother -------------------------------------------------------------------------------------------------------------
 def test_the_smoother_finds_a_disturbance_through_noise_without_lag():
     rng, dt_s = np.random.default_rng(11), np.full(1499, 0.02)
