@@ -70,15 +70,16 @@ class Place(NamedTuple):
 @kernel
 def word(data, at):
     """The eight bytes at data[at] as a little-endian integer (one load, once compiled)."""
+    k = np.uint64(at)  # unsigned: no index from behind, so that eight loads become one
     return (
-        np.uint64(data[at])
-        | np.uint64(data[at + 1]) << np.uint64(8)
-        | np.uint64(data[at + 2]) << np.uint64(16)
-        | np.uint64(data[at + 3]) << np.uint64(24)
-        | np.uint64(data[at + 4]) << np.uint64(32)
-        | np.uint64(data[at + 5]) << np.uint64(40)
-        | np.uint64(data[at + 6]) << np.uint64(48)
-        | np.uint64(data[at + 7]) << np.uint64(56)
+        np.uint64(data[k])
+        | np.uint64(data[k + np.uint64(1)]) << np.uint64(8)
+        | np.uint64(data[k + np.uint64(2)]) << np.uint64(16)
+        | np.uint64(data[k + np.uint64(3)]) << np.uint64(24)
+        | np.uint64(data[k + np.uint64(4)]) << np.uint64(32)
+        | np.uint64(data[k + np.uint64(5)]) << np.uint64(40)
+        | np.uint64(data[k + np.uint64(6)]) << np.uint64(48)
+        | np.uint64(data[k + np.uint64(7)]) << np.uint64(56)
     )
 
 
