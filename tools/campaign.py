@@ -30,6 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--jobs", type=int, default=os.cpu_count() or 1, metavar="N", help="worker processes (default: %(default)s)"
     )
+    parser.add_argument("--dask", metavar="ADDRESS", help="fly on the workers of this dask.distributed scheduler")
     parser.add_argument(
         "--keep",
         choices=("none", "failed", "all"),
@@ -72,7 +73,7 @@ def _engine(args: argparse.Namespace) -> Any:
 
 
 def _fly(engine: Any, todo: list[Flight], store: Any, progress: "Progress", args: argparse.Namespace, out: Path) -> None:
-    from tools.campaigns import workers
+    from tools.campaigns import dask_cluster, workers
 
     engine.prepare(todo, progress.say)
     runs = str(out.with_name(out.name + ".runs"))
@@ -80,9 +81,14 @@ def _fly(engine: Any, todo: list[Flight], store: Any, progress: "Progress", args
     def arguments(chunk: list[Flight]) -> tuple[Any, ...]:
         return [flight.words for flight in chunk], [flight.id for flight in chunk], runs, args.keep
 
+    chunks = engine.chunks(todo)
+    if args.dask:
+        flown = dask_cluster.run(engine.fly_chunk, chunks, arguments, args.dask)
+    else:
+        flown = workers.run(engine.fly_chunk, chunks, arguments, args.jobs, engine.PROCESSES)
     progress.begin()
     try:
-        for chunk, results in workers.run(engine.fly_chunk, engine.chunks(todo), arguments, args.jobs, engine.PROCESSES):
+        for chunk, results in flown:
             store.add(engine.NAME, zip(chunk, results, strict=True))
             progress.flown(chunk, results)
     except KeyboardInterrupt:

@@ -5,10 +5,11 @@ import math
 
 import pytest
 
+from mavquad import wire
 from mavquad.link.columns import Log
 from tools import bench
 from tools.__main__ import main
-from tools.benches import Row, cpu_s, reading
+from tools.benches import Row, bulk, cpu_s, growth, live, reading
 
 
 def test_every_part_can_be_measured_and_says_what_it_is():
@@ -52,3 +53,35 @@ def test_an_unknown_part_is_said(capsys):
 def test_cpu_time_is_that_of_the_work():
     assert cpu_s(lambda: sum(range(200_000)), 3) == pytest.approx(cpu_s(lambda: sum(range(200_000)), 3), rel=3.0)
     assert cpu_s(lambda: None) < cpu_s(lambda: sum(range(200_000)))
+
+
+def test_the_live_contestants_fly_the_same_setpoint():
+    told = []
+    with live._bound() as vehicle:
+        vehicle.settimeout(10.0)
+        for kind in (live._OurLoop, live._MavutilLoop):
+            loop = kind(vehicle.getsockname()[1])
+            for k in (30, 31, 32):
+                vehicle.sendto(b"".join(live.telemetry(k)), loop.sock.getsockname())
+                loop.turn(k)
+                (frame,) = wire.split(vehicle.recv(2048))[0]
+            loop.sock.close()
+            told.append(wire.decode(frame))
+    assert told[0].time_boot_ms == told[1].time_boot_ms == 256
+    assert told[0].thrust == pytest.approx(told[1].thrust, abs=1e-3)
+    assert told[0].q == pytest.approx(told[1].q, abs=1e-2)
+
+
+def test_the_limit_in_c_and_a_missing_peer_are_rows_whatever_happens(monkeypatch):
+    monkeypatch.delenv("MAVQUAD_PEERS", raising=False)
+    missing = bulk._rotorpy()
+    assert math.isnan(missing.value)
+    assert "not installed" in missing.note
+    monkeypatch.setattr(bulk.shutil, "which", lambda name: None)
+    assert "no C compiler" in bulk._limit().note
+
+
+def test_growth_says_how_cost_grows():
+    rows = growth._table("a task", "ours", "things", [(1, 1.0), (2, 2.0), (4, 8.0)], "s")
+    assert [row.note for row in rows] == ["", "", "exponent 2.00"]
+    assert rows[0].what == "a task, 1 things"

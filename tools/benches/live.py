@@ -1,0 +1,328 @@
+"""the live path: codec beside pymavlink, a message in to a setpoint out beside pymavlink.mavutil, a composed tick, lockstep, start and memory.
+
+Contestants take turns in every round and the figure is the median over rounds; the spread of ours stands in the note. The two loops run the same
+controller on the same telemetry over a loopback UDP socket, in one thread: what is timed begins when the datagram has been sent and ends when
+the answer has. The composed tick is CPU time.
+"""
+
+import math
+import os
+import signal
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mavquad import config, control_step, lifecycle, paths, pipeline, wire
+from mavquad import flight as flights
+from mavquad import plan as plans
+from mavquad.plan import Plan
+from mavquad.setpoint import attitude, limits
+from mavquad.settings import Companion
+from mavquad.signals import ZERO3, Attitude, Demand, Position, Setpoint
+from tools.benches import Row
+
+_ROUNDS = 15
+_DT_US = 8000
+
+
+def measure(seconds: float) -> list[Row]:
+    """All of it; `seconds` sets how many messages and how long a flight."""
+    return [*codec(seconds), *loops(seconds), *composed(seconds), *programs(seconds)]
+
+
+# ---- codec --------------------------------------------------------------------------------------------------------------
+def codec(seconds: float) -> list[Row]:
+    """Decode one message and encode another."""
+    from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+    many = max(200, round(200 * seconds))
+    raw = wire.encode(
+        "ATTITUDE_QUATERNION", (1000, 1.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3, (0.0,) * 4), seq=0, system=1, component=1
+    )
+    fields = (1000, 1, 1, 7, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.5, (0.0, 0.0, 0.0))
+    link = dialect.MAVLink(None, srcSystem=1, srcComponent=191)
+
+    def ours() -> None:
+        for frame in wire.split(raw)[0]:
+            wire.decode(frame)
+        wire.encode("SET_ATTITUDE_TARGET", fields, seq=1, system=1, component=191)
+
+    def theirs() -> None:
+        link.parse_buffer(raw)
+        link.set_attitude_target_encode(*fields[:-1]).pack(link)
+
+    spent = _rounds({"ours": _repeated(ours, many), "pymavlink": _repeated(theirs, many)})
+    us = {who: [1e6 * s / many for s in times] for who, times in spent.items()}
+    rows = [_row("decode + encode of one message", who, times, "us") for who, times in us.items()]
+    return [*rows, _times("decode + encode of one message", us, "pymavlink")]
+
+
+# ---- a message in, a setpoint out -----------------------------------------------------------------------------------------
+def hovering(**chosen: Any) -> tuple[Plan, pipeline.Flight]:
+    """A companion that has been engaged in a hover."""
+    plan = plans.build(config.convert({"observers": [], **chosen}, Companion, "bench"))
+    f = flights.start(plan)
+    for k in range(1, 30):
+        for raw in telemetry(k, first=k == 1):
+            f = pipeline.feed(plan, f, k * _DT_US, wire.split(raw)[0][0])
+    f = f.clone()
+    f.life = f.life._replace(state=lifecycle.ENGAGED, phase="path", armed=True, mode=6 << 16, autopilot=lifecycle.PX4)
+    control_step.anchor(plan, f)
+    f.path_t0_us = f.now_us
+    return plan, f
+
+
+def telemetry(k: int, first: bool = False) -> list[bytes]:
+    """The frames of control period k of a vehicle in a hover, the attitude last."""
+    t_us = k * _DT_US
+    ms, half = t_us // 1000, 0.005 * math.sin(1e-6 * t_us)
+    q = (math.cos(half), math.sin(half), 0.0, 0.0)
+    found: list[tuple[str, tuple[Any, ...]]] = [("HEARTBEAT", (2, 12, 0, 0, 4, 3))] if first else []
+    if k % 3 == 0 or first:
+        found.append(("LOCAL_POSITION_NED", (ms, 0.0, 0.0, -5.0, 0.0, 0.0, 0.0)))
+    found += [
+        ("HIGHRES_IMU", (t_us, 0.0, 0.0, -9.8, *(0.0,) * 10, 0, 0)),
+        ("ATTITUDE_QUATERNION", (ms, *q, 0.0, 0.0, 0.0, (0.0,) * 4)),
+    ]
+    return [wire.encode(name, fields, seq=k & 0xFF, system=1, component=1) for name, fields in found]
+
+
+class _OurLoop:
+    """Datagram in, `pipeline`, datagram out: what the companion does between its socket calls."""
+
+    def __init__(self, port: int) -> None:
+        self.plan, self.flight = hovering(controller="pid")
+        self.sock = _bound()
+        self.to = ("127.0.0.1", port)
+
+    def turn(self, k: int) -> None:
+        data = self.sock.recv(2048)
+        self.flight = pipeline.feed_all(self.plan, self.flight, k * _DT_US + 5000, wire.split(data)[0])
+        for _, raw in self.flight.outbox:
+            if raw[7] == 82:  # SET_ATTITUDE_TARGET
+                self.sock.sendto(raw, self.to)
+
+
+class _MavutilLoop:
+    """The same stages called from a loop as people write it with pymavlink.mavutil."""
+
+    def __init__(self, port: int) -> None:
+        from pymavlink import mavutil
+
+        self.plan, _ = hovering(controller="pid")
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.bind(("127.0.0.1", 0))
+            mine = probe.getsockname()[1]
+        self.link = mavutil.mavlink_connection(
+            f"udpin:127.0.0.1:{mine}", dialect="ardupilotmega", source_system=1, source_component=191
+        )
+        self.sock = self.link.port
+        self.estimator = self.plan.estimator.module.init(self.plan.estimator.gains)
+        self.controller = self.plan.controller.module.init(self.plan.controller.gains)
+        self.sent = Setpoint((1.0, 0.0, 0.0, 0.0), ZERO3, self.plan.airframe.hover_thrust, 7)
+
+    def turn(self, k: int) -> None:
+        plan = self.plan
+        while True:
+            m = self.link.recv_match(blocking=True)
+            kind = m.get_type()
+            if kind == "LOCAL_POSITION_NED":
+                self._observe(Position(1000 * m.time_boot_ms, (m.x, m.y, m.z), (m.vx, m.vy, m.vz)))
+            elif kind == "ATTITUDE_QUATERNION":
+                break
+        t_us = 1000 * m.time_boot_ms
+        self._observe(Attitude(t_us, (m.q1, m.q2, m.q3, m.q4), (m.rollspeed, m.pitchspeed, m.yawspeed)))
+        self.estimator, estimate = plan.estimator.module.step(plan.estimator.gains, self.estimator, None, t_us)
+        demand: Demand = paths.demand(plan.path, 0, (0.0, 0.0, -5.0), 0.0, t_us)
+        self.controller, command = plan.controller.module.step(
+            plan.controller.gains, self.controller, estimate, demand, None, 1e-6 * _DT_US
+        )
+        thrust = attitude.thrust_vector(command.a_ned_m_s2, plan.limits.tilt_rad, 0.2 * attitude.G_M_S2, 1.8 * attitude.G_M_S2)
+        q, size = attitude.attitude(thrust, command.yaw_rad)
+        wanted = Setpoint(q, ZERO3, plan.airframe.hover_thrust * size / attitude.G_M_S2, 7)
+        self.sent, _ = limits.apply(plan.limits, self.sent, wanted, 1e-6 * _DT_US)
+        self.link.mav.set_attitude_target_send(m.time_boot_ms, 1, 1, 7, self.sent.q_wxyz, 0, 0, 0, self.sent.thrust)
+
+    def _observe(self, sample: Any) -> None:
+        self.estimator = self.plan.estimator.module.observe(self.plan.estimator.gains, self.estimator, sample)
+
+
+def loops(seconds: float) -> list[Row]:
+    """IMU and attitude in, setpoint out, over a socket."""
+    many = max(50, round(30 * seconds))
+    rows, us, tails = [], {}, {}
+    with _bound() as vehicle:
+        for who, kind in (("ours", _OurLoop), ("pymavlink.mavutil", _MavutilLoop)):
+            loop = kind(vehicle.getsockname()[1])
+            where = loop.sock.getsockname()
+            times: list[list[float]] = []
+            k = 30
+            for round_ in range(_ROUNDS + 1):
+                spent = []
+                for _ in range(many):
+                    vehicle.sendto(b"".join(telemetry(k)), where)
+                    begun = time.perf_counter_ns()
+                    loop.turn(k)
+                    spent.append(1e-3 * (time.perf_counter_ns() - begun))
+                    vehicle.recv(2048)
+                    k += 1
+                if round_:  # the first warms up
+                    times.append(spent)
+            loop.sock.close()
+            us[who] = [statistics.median(spent) for spent in times]
+            tails[who] = float(np.percentile(np.concatenate(times), 99))
+            rows.append(_row("IMU in to setpoint out, p50", who, us[who], "us", f"p99 {tails[who]:.0f} us"))
+    return [*rows, _times("IMU in to setpoint out, p50", us, "pymavlink.mavutil")]
+
+
+# ---- a composed tick --------------------------------------------------------------------------------------------------------
+def composed(seconds: float) -> list[Row]:
+    """Decode, EKF, closed-form MPC, ASMF, encode: CPU time of one control period."""
+    rows = []
+    for who, chosen in (
+        ("pid", {"controller": "pid"}),
+        (
+            "EKF + closed-form MPC",
+            {"controller": "eskf-mpc", "estimator": "joint", "tune": {"eskf-mpc": {"constrained": "off"}}},
+        ),
+        (
+            "EKF + closed-form MPC + ASMF",
+            {
+                "controller": "eskf-mpc",
+                "estimator": "joint",
+                "compensator": "asmf",
+                "tune": {"eskf-mpc": {"constrained": "off"}},
+            },
+        ),
+    ):
+        plan, flight = hovering(**chosen)
+        many, k, per_tick = max(25, round(10 * seconds)), 30, []
+        for round_ in range(_ROUNDS + 1):
+            frames = [b"".join(telemetry(k + i)) for i in range(many)]
+            begun = time.process_time_ns()
+            for i, data in enumerate(frames):
+                flight = pipeline.feed_all(plan, flight, (k + i) * _DT_US + 5000, wire.split(data)[0])
+            if round_:
+                per_tick.append(1e-3 * (time.process_time_ns() - begun) / many)
+            k += many
+        rows.append(
+            _row(
+                "decode, estimate, control, encode: one tick",
+                who,
+                per_tick,
+                "us CPU",
+                "stages called from Python, 2.3 messages in",
+            )
+        )
+    return rows
+
+
+# ---- the programs -------------------------------------------------------------------------------------------------------------
+def programs(seconds: float) -> list[Row]:
+    """A flight in lockstep as two processes, the companion's memory in it, and how soon a companion speaks."""
+    from tools import flight, scenarios
+
+    with tempfile.TemporaryDirectory() as folder:
+        run = Path(folder) / "run"
+        changes = [f"path.duration_s={max(5.0, seconds):g}"]
+        resolved = scenarios.resolve(scenarios.load("hover", changes), scenarios.Options(controller="pid", observers=[]))
+        flight.prepare(run, resolved)
+        peak = [math.nan]
+
+        def watch(t_s: float, said: list[str]) -> None:
+            peak.append(_memory_mb(str(run / "companion.toml")))
+
+        flown = flight.fly(run, flight.Pace(None), resolved.scenario.flight.max_time_s, watch)
+        first_s = statistics.median(_first_frame_s(run, Path(folder) / f"again-{i}") for i in range(3))
+    sitl, wall_s = flown.sitl, flown.sitl.get("wall_s") or math.nan
+    periods = sitl.get("periods") or math.nan
+    per_period = f"{sitl.get('messages_sent', 0) / periods:.1f} messages in and {sitl.get('messages_received', 0) / periods:.1f} out a step"
+    return [
+        Row("lockstep over UDP, two processes", "pid", periods / wall_s, "control steps/s", per_period),
+        Row(
+            "memory of the companion, peak",
+            "pid",
+            float(np.nanmax(peak)) if not np.isnan(peak).all() else math.nan,
+            "MB",
+            "of the process, Linux only",
+        ),
+        Row("start of the companion to its first frame", "pid", first_s, "s", "kernels in the cache"),
+    ]
+
+
+def _memory_mb(mark: str) -> float:
+    """Peak resident memory of the process whose command line holds `mark`; NaN where there is none or no /proc."""
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            if mark.encode() in (path / "cmdline").read_bytes():
+                lines = (path / "status").read_text().splitlines()
+                return next(1e-3 * float(line.split()[1]) for line in lines if line.startswith("VmHWM"))
+        except (OSError, StopIteration):
+            continue
+    return math.nan
+
+
+def _first_frame_s(run: Path, folder: Path) -> float:
+    with _bound() as sock:
+        sock.settimeout(60.0)
+        endpoint = f"udpout:127.0.0.1:{sock.getsockname()[1]}"
+        folder.mkdir()
+        command = [sys.executable, "-P", "-m", "mavquad", "--config", str(run / "companion.toml"), "--endpoint", endpoint]
+        begun = time.monotonic()
+        child = subprocess.Popen(
+            [*command, "--run", str(folder), "--lockstep"], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+        )
+        try:
+            sock.recv(2048)
+            return time.monotonic() - begun
+        except TimeoutError:
+            return math.nan
+        finally:
+            os.kill(child.pid, signal.SIGKILL)
+            child.wait()
+
+
+# ---- helpers ----------------------------------------------------------------------------------------------------------------
+def _bound() -> socket.socket:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.bind(("127.0.0.1", 0))
+    return sock
+
+
+def _repeated(task: Callable[[], None], many: int) -> Callable[[], float]:
+    def run() -> float:
+        begun = time.perf_counter()
+        for _ in range(many):
+            task()
+        return time.perf_counter() - begun
+
+    return run
+
+
+def _rounds(contestants: dict[str, Callable[[], float]]) -> dict[str, list[float]]:
+    """Seconds of each contestant, round by round in turn; one round before that warms up."""
+    spent: dict[str, list[float]] = {who: [] for who in contestants}
+    for round_ in range(_ROUNDS + 1):
+        for who, run in contestants.items():
+            seconds = run()
+            if round_:
+                spent[who].append(seconds)
+    return spent
+
+
+def _row(what: str, who: str, values: list[float], unit: str, note: str = "") -> Row:
+    spread = f"rounds {min(values):.3g} to {max(values):.3g}"
+    return Row(what, who, statistics.median(values), unit, f"{spread}; {note}" if note else spread)
+
+
+def _times(what: str, values: dict[str, list[float]], peer: str) -> Row:
+    ratios = [theirs / ours for ours, theirs in zip(values["ours"], values[peer], strict=True)]
+    return _row(f"{what}: {peer} over", "ours", ratios, "times")
