@@ -15,8 +15,7 @@ from mavsdk.asyncio.plugins.param import ParamAsync
 from mavsdk.asyncio.plugins.telemetry import TelemetryAsync
 from mavsdk.plugins.offboard import Attitude, AttitudeRate
 
-RATES_HZ = {  # rc_status brings SYS_STATUS, where health is read
-    "rc_status": 2.0,
+RATES_HZ = {
     "gps_info": 2.0,
     "home": 1.0,
     "landed_state": 5.0,
@@ -70,7 +69,8 @@ async def fly(url, personality, seen):
     seen["system"] = await system.get_system_id()
     seen["autopilot"] = str(await system.autopilot_type())
     action, telemetry, param, offboard = (kind(system) for kind in (ActionAsync, TelemetryAsync, ParamAsync, OffboardAsync))
-    for name, hz in RATES_HZ.items():
+    # on ArduPilot, which sends nothing unasked, rc_status brings SYS_STATUS, where health is read
+    for name, hz in {**RATES_HZ, **({"rc_status": 2.0} if personality == "ardupilot" else {})}.items():
         await getattr(telemetry, f"set_rate_{name}")(hz)
     seen["set_rate_odometry"] = await refused(telemetry.set_rate_odometry(50.0))
     seen["all_ok"] = await first(telemetry.subscribe_health_all_ok(), bool)
