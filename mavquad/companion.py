@@ -20,6 +20,7 @@ from typing import Any
 
 from mavquad import lifecycle, pipeline, relay, wire
 from mavquad.errors import FlightError
+from mavquad.lifecycle import Life
 from mavquad.link import clock, health
 from mavquad.link.endpoint import Address, Endpoint, UdpEndpoint
 from mavquad.link.signing import SETUP_SIGNING, Signer
@@ -184,9 +185,19 @@ class Companion:
         for row in flight.trace:
             self.trace.write(row)
         flight.outbox, flight.trace = [], []
-        if flight.life.state != before.life.state:
-            self.states.append((1e-6 * flight.now_us, flight.life.state, flight.life.reason))
-            print(f"{1e-6 * flight.now_us:9.3f} s  {flight.life.state}: {flight.life.reason}", file=sys.stderr, flush=True)
+        if flight.life is not before.life:
+            self._tell(before.life, flight.life, 1e-6 * flight.now_us)
+
+    def _tell(self, was: Life, life: Life, t_s: float) -> None:
+        """What a person is shown: changes of state, complaints, and what the autopilot says."""
+        new = life.heard.whole - was.heard.whole
+        for words in life.heard.recent[-new:] if new > 0 else ():
+            print(f"{t_s:9.3f} s  autopilot: {words}", file=sys.stderr, flush=True)
+        if life.said != was.said and life.said:
+            print(f"{t_s:9.3f} s  {life.said}", file=sys.stderr, flush=True)
+        if life.state != was.state:
+            self.states.append((t_s, life.state, life.reason))
+            print(f"{t_s:9.3f} s  {life.state}: {life.reason}", file=sys.stderr, flush=True)
 
     def _flush(self) -> None:
         """Send what has gathered, several frames to a datagram."""

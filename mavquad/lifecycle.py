@@ -7,6 +7,8 @@ Every function takes the state and returns it with the frames to send (name, fie
 import math
 from typing import Any, NamedTuple
 
+from mavquad import autopilot_words
+from mavquad.autopilot_words import WARNING, Heard
 from mavquad.settings import Companion
 
 SEARCHING, CONFIGURING, OBSERVING, STREAMING, ENGAGED, RELEASED = (
@@ -28,8 +30,11 @@ ARMED = 128
 GUIDED, LAND_MODE = 4, 9  # ArduCopter
 OFFBOARD = 6 << 16  # PX4: main mode in byte 2
 LAND_PX4 = 4 << 16 | 6 << 24
+_PX4_ON_THE_WAY = (4 << 16 | 2 << 24, 4 << 16 | 3 << 24)  # take-off, hold: modes it takes by itself while we lead it up
 STEPS_HZ = (250.0, 200.0, 100.0, 50.0, 25.0, 10.0, 4.0)
 _RETRY_US, _TRIES = 500_000, 4
+_IN_PROGRESS_US = 3_000_000  # more time for a command that is being carried out
+_TEXT_US = 2_000_000  # a text and a refusal this close belong together: either may come first
 
 Send = tuple[str, tuple[Any, ...]]
 Sends = tuple[Send, ...]
@@ -78,12 +83,16 @@ class Life(NamedTuple):
     ended: bool  # the path is over, or landing was asked for
     airborne: bool  # has been, since the last arming
     said: str  # last complaint, so that it is not repeated each time
+    heard: Heard  # what the autopilot says in words
+    refused: str  # the purpose it refused last
+    refused_us: int
 
 
 def init(settings: Companion) -> Life:
     rates = tuple(Rate(name, 0, hz, math.nan) for name, hz in settings.link.rates_hz.items())
     return Life(
-        SEARCHING, "", "", (0, 0), 0, False, 0, 0, math.nan, 0, None, rates, 0, (), 0, 0, (), False, 0, 0, False, False, ""
+        *(SEARCHING, "", "", (0, 0), 0, False, 0, 0, math.nan, 0, None, rates, 0, (), 0, 0, (), False, 0, 0, False, False),
+        *("", Heard(), "", 0),
     )
 
 
@@ -141,13 +150,39 @@ def on_heartbeat(life: Life, source: tuple[int, int], message: Any, now_us: int,
     if source != life.target:
         return life, ()
     armed = bool(message.base_mode & ARMED)
-    life = life._replace(armed=armed, mode=message.custom_mode, heard_us=now_us, airborne=life.airborne and armed)
+    was, life = life, life._replace(armed=armed, mode=message.custom_mode, heard_us=now_us, airborne=life.airborne and armed)
     if life.state == ENGAGED and not guided(life):
-        landing = life.phase == "landing"
-        return release(life, now_us, "landing by the autopilot" if landing else f"mode {message.custom_mode} set by another")
-    if life.state in (STREAMING, ENGAGED) and not armed:
+        return release(life, now_us, "landing by the autopilot" if life.phase == "landing" else _taken(life, now_us))
+    leading = life.state == STREAMING or (life.state == OBSERVING and life.engage)
+    if leading and life.mode != was.mode and not guided(life) and not _on_the_way(life):
+        return release(life, now_us, _taken(life, now_us))
+    if (life.state == ENGAGED or leading) and was.armed and not armed:
         return release(life, now_us, "disarmed")
     return life, ()
+
+
+def _on_the_way(life: Life) -> bool:
+    return life.autopilot != ARDUPILOT and life.mode in _PX4_ON_THE_WAY
+
+
+def _taken(life: Life, now_us: int) -> str:
+    """Why we let go of a vehicle whose mode has changed, with what it said about it."""
+    words = f"mode {autopilot_words.mode(life.autopilot, life.mode)} set by another"
+    why = life.heard.text
+    return f"{words}: {why}" if _just_heard(life, now_us) and autopilot_words.reason(why) == why else words
+
+
+def _just_heard(life: Life, now_us: int) -> bool:
+    return life.heard.severity <= WARNING and now_us - life.heard.t_us <= _TEXT_US and bool(life.heard.text)
+
+
+def on_text(life: Life, message: Any, now_us: int) -> tuple[Life, Sends]:
+    """STATUSTEXT of the autopilot: the reason of a refusal that came just before is passed on."""
+    heard, whole = autopilot_words.hear(life.heard, message, now_us)
+    life = life._replace(heard=heard)
+    if not whole or not life.refused or now_us - life.refused_us > _TEXT_US or heard.severity > WARNING:
+        return life, ()
+    return _say_once(life, f"{life.refused} refused: {autopilot_words.reason(heard.text)}")
 
 
 def guided(life: Life) -> bool:
@@ -168,7 +203,7 @@ def on_request(life: Life, number: int, now_us: int) -> tuple[Life, Sends, int]:
     if number == CMD_ENGAGE:
         if life.state in (STREAMING, ENGAGED):
             return life, (), ACCEPTED
-        life = life._replace(engage=True, ended=False, steady_us=0)
+        life = life._replace(engage=True, ended=False, steady_us=0, said="")
         if life.state == RELEASED:
             life, sends = go(life, OBSERVING, "", now_us, "asked to engage again")
             return life, sends, ACCEPTED
@@ -179,21 +214,38 @@ def on_request(life: Life, number: int, now_us: int) -> tuple[Life, Sends, int]:
 
 
 def on_ack(life: Life, message: Any, now_us: int, settings: Companion) -> tuple[Life, Sends]:
-    """COMMAND_ACK: go on, step down, or try again."""
+    """COMMAND_ACK: go on, step down, try again later, or give up where it would be refused again."""
     p = life.pending
-    if p is None or message.command != p.command or message.result == IN_PROGRESS:
+    own = settings.link
+    # an older autopilot's ACK names nobody
+    ours = message.target_system in (0, own.system) and message.target_component in (0, own.component)
+    if p is None or message.command != p.command or not ours:
         return life, ()
+    if message.result == IN_PROGRESS:
+        return life._replace(pending=p._replace(due_us=now_us + _IN_PROGRESS_US)), ()
     life = life._replace(pending=None)
     if p.purpose == "rate":
         return _rate_answered(life, message.result == ACCEPTED, now_us)
-    if message.result != ACCEPTED and p.purpose in ("arm", "takeoff", "mode"):
-        # refused, with a STATUSTEXT of its own: try again in a while
-        said = f"{p.purpose} refused ({message.result}), trying again"
-        sends = () if said == life.said else (text(f"mavquad: {said}", 4),)
-        return life._replace(phase=f"wait {p.purpose}", since_us=now_us, said=said), sends
+    if message.result != ACCEPTED:
+        return _refused(life, p.purpose, message.result, now_us)
+    life = life._replace(refused="")
     if p.purpose == "takeoff":
         return life._replace(phase="climb", since_us=now_us, steady_us=0), ()
     return life, ()
+
+
+def _refused(life: Life, purpose: str, result: int, now_us: int) -> tuple[Life, Sends]:
+    """Shown with the autopilot's reason. Tried again in a while, unless it says that the same would be refused again."""
+    if purpose == "message":
+        return (life._replace(phase="wait message", since_us=now_us) if life.engage else life), ()
+    explained = _just_heard(life, now_us)
+    words = f"{purpose} refused: {autopilot_words.reason(life.heard.text) if explained else autopilot_words.result(result)}"
+    if result in (DENIED, UNSUPPORTED) and purpose != "land":
+        return release(life, now_us, words)
+    life = life._replace(phase=f"wait {purpose}", since_us=now_us, refused=purpose, refused_us=now_us)
+    if not explained and life.said.startswith(f"{purpose} refused: "):
+        return life, ()  # its reason was shown, and comes again behind this answer
+    return _say_once(life, words)
 
 
 def on_param(life: Life, name: str, value: float, now_us: int) -> Life:
@@ -284,12 +336,14 @@ def on_tick(life: Life, sight: Sight, now_us: int, settings: Companion) -> tuple
         if not guided(life) and life.pending is None and waited_s >= 1.2:
             life, sends = command(life, CMD_SET_MODE, _mode(life), "mode", now_us)
             return life._replace(since_us=now_us - 1_000_000), sends
-    if life.state == ENGAGED and life.ended and life.pending is None and life.phase != "landing":
+    again = life.phase != "wait land" or now_us - life.since_us > 2_000_000
+    if life.state == ENGAGED and life.ended and life.pending is None and life.phase != "landing" and again:
         if life.autopilot == ARDUPILOT:
             life, sends = command(life, CMD_SET_MODE, (1.0, float(LAND_MODE)), "land", now_us)
         else:
             life, sends = command(life, CMD_LAND, (0.0, 0.0, 0.0, math.nan, math.nan, math.nan, math.nan), "land", now_us)
-        return life._replace(phase="landing"), (*sends, text("mavquad: path over, landing"))
+        said = () if life.phase == "wait land" else (text("mavquad: path over, landing"),)
+        return life._replace(phase="landing"), (*sends, *said)
     return life, ()
 
 
@@ -304,6 +358,8 @@ def _say_once(life: Life, words: str) -> tuple[Life, Sends]:
 
 
 def _before_flight(life: Life, sight: Sight, now_us: int, settings: Companion) -> tuple[Life, Sends]:
+    if life.phase == "parameters":  # one is being asked for again
+        return life, ()
     waited_s = 1e-6 * (now_us - life.since_us)
     if sight.attitude_age_s > 0.5 or sight.position_age_s > 0.5:
         missing = "attitude" if sight.attitude_age_s > 0.5 else "local position"
@@ -315,9 +371,13 @@ def _before_flight(life: Life, sight: Sight, now_us: int, settings: Companion) -
     if life.autopilot == ARDUPILOT and settings.controller != "autopilot":
         options = param(life, "GUID_OPTIONS")
         if math.isnan(options):
-            return release(life, now_us, "GUID_OPTIONS cannot be read")
+            words = "asking for GUID_OPTIONS again"
+            if life.said == words:
+                return release(life, now_us, "GUID_OPTIONS cannot be read")
+            life = life._replace(phase="parameters", wants=("GUID_OPTIONS",), wants_due_us=now_us, wants_tries=0)
+            return _say_once(life, words)
         if not int(options) & 8:  # thrust would be a climb rate
-            return release(life, now_us, "set GUID_OPTIONS to 8")
+            return release(life, now_us, f"set GUID_OPTIONS to {int(options) | 8}")
     if life.phase in ("takeoff", "climb", "takeover") and not life.armed and waited_s > 3.0:
         life = life._replace(phase="", since_us=now_us)  # it has disarmed, or restarted so early that its clock did not show it
     aloft = life.armed and (life.landed == 2 or sight.height_m > 0.5 * settings.takeoff_m)

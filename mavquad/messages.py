@@ -34,6 +34,12 @@ def _command_long(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
     outbox.send_all(plan, f, sends)
 
 
+def _statustext(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
+    if (frame.system, frame.component) == f.life.target:
+        f.life, sends = lifecycle.on_text(f.life, m, f.arrival_us)
+        outbox.send_all(plan, f, sends)
+
+
 def _timesync(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
     if m.tc1 == 0:
         outbox.send(plan, f, "TIMESYNC", (publish.nanoseconds(f.arrival_us), m.ts1, frame.system, frame.component))
@@ -116,6 +122,7 @@ _BY_NAME: dict[str, Callable[[Plan, Flight, Frame, Any], None]] = {
     "HEARTBEAT": _heartbeat,
     "COMMAND_ACK": _command_ack,
     "COMMAND_LONG": _command_long,
+    "STATUSTEXT": _statustext,
     "TIMESYNC": _timesync,
     "PARAM_VALUE": _param_value,
     "PARAM_REQUEST_LIST": _param_request_list,

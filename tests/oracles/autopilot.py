@@ -17,6 +17,8 @@ OFFBOARD, HOLD, TAKEOFF, LAND = 6 << 16, 4 << 16 | 3 << 24, 4 << 16 | 2 << 24, 4
 class Autopilot:
     """Advance by `step()`: frames out, then give it what was sent by `hear()`."""
 
+    kind = 12
+
     def __init__(self, hz: float = 100.0, system: int = 1) -> None:
         self.dt_us = round(1e6 / hz)
         self.t_us = 0
@@ -33,6 +35,7 @@ class Autopilot:
         self.muted: set[str] = set()
         self.denied_above_hz = 250.0
         self.rates: dict[int, float] = {}
+        self.params = {"MPC_THR_HOVER": 0.5735}
         self.jump: Vec3 = (0.0, 0.0, 0.0)
         self.seq = 0
         self.answers: list[bytes] = []
@@ -51,8 +54,8 @@ class Autopilot:
                 self._command(m)
             elif name == "SET_ATTITUDE_TARGET":
                 self.setpoints.append((self.t_us, m))
-            elif name == "PARAM_REQUEST_READ" and m.param_id == "MPC_THR_HOVER":
-                self.send("PARAM_VALUE", "MPC_THR_HOVER", 0.5735, 9, 1, 0)
+            elif name == "PARAM_REQUEST_READ" and m.param_id in self.params:
+                self.send("PARAM_VALUE", m.param_id, self.params[m.param_id], 9, 1, 0)
 
     def _command(self, m: object) -> None:
         result = 0
@@ -83,7 +86,7 @@ class Autopilot:
             self._move(dt)
         q = self.q
         if self.t_us % 1_000_000 < self.dt_us or self.t_us == self.dt_us:
-            self.send("HEARTBEAT", 2, 12, 128 if self.armed else 0, self.mode, 4, 3)
+            self.send("HEARTBEAT", 2, self.kind, 128 if self.armed else 0, self.mode, 4, 3)
         if t % 20_000 == 0:
             x, y, z = self.p + self.jump
             self.send("LOCAL_POSITION_NED", t // 1000, x, y, z, *self.v)
@@ -95,25 +98,30 @@ class Autopilot:
         out, self.answers = self.answers, []
         return out
 
-    def _move(self, dt: float) -> None:
+    def _task(self) -> str:
+        """What it flies now."""
         if self.mode == OFFBOARD and self.t_us - self.setpoints[-1][0] > 500_000:
             self.mode = HOLD  # its own failsafe: setpoints have stopped
-        if self.mode == OFFBOARD:
+        return {OFFBOARD: "setpoints", TAKEOFF: "takeoff", LAND: "land"}.get(self.mode, "hold")
+
+    def _move(self, dt: float) -> None:
+        task = self._task()
+        if task == "setpoints":
             m = self.setpoints[-1][1]
             w, x, y, z = m.q
             self.q, self.thrust = (w, x, y, z), m.thrust
             push = 9.80665 * m.thrust / 0.5735
             up = np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
             a = np.array([0, 0, 9.80665]) - push * up
-        elif self.mode == TAKEOFF:
+        elif task == "takeoff":
             a = np.array([0, 0, 4.0 * (-self.goal - self.p[2])]) - 4.0 * self.v
-        elif self.mode == LAND:
+        elif task == "land":
             a = 4.0 * (np.array([0, 0, 0.8]) - self.v)
         else:
             a = -4.0 * self.v
         self.v = self.v + dt * a
         self.p = self.p + dt * self.v
-        if self.p[2] > 0.0 and self.mode == LAND:
+        if self.p[2] > 0.0 and task == "land":
             self.p[2], self.v, self.armed = 0.0, np.zeros(3), False
 
 
