@@ -5,7 +5,7 @@ CLIENTS := .venv-clients
 STAMP := .venv/.installed
 SCENARIO ?= gusty
 
-.PHONY: fly test test-page long mutate install test-clients lint clean
+.PHONY: fly test test-page long soak mutate install test-clients fuzz lint clean
 
 fly: install
 	@$(BIN)/mavquad versus $(SCENARIO)
@@ -35,6 +35,9 @@ test-page: install  # every page in a real browser: Debian's package chromium
 long: install  # eighty minutes of vehicle time in lockstep: flat memory, no miss
 	$(BIN)/python -m pytest -s tests/loop/test_long_flight.py -m slow
 
+soak: install  # eighty minutes of vehicle time at ten times real time with faults and a listener between (MAVQUAD_SOAK_MINUTES)
+	$(BIN)/python -m pytest -s tests/loop/test_soak.py -m slow
+
 test-clients: install $(CLIENTS)/.installed  # MAVSDK, MAVProxy, pymavlink's tools and node-mavlink against the simulated autopilot
 	$(BIN)/python -m pytest tests/clients -m slow
 
@@ -50,5 +53,15 @@ $(CLIENTS)/.installed: requirements-clients.txt tests/clients/programs/package-l
 mutate: install  # every sign of the observer turned around, one at a time: the fast tests must notice (an hour of CPU)
 	NUMBA_DISABLE_JIT=1 $(BIN)/python tests/observer_signs.py
 
+FUZZ_SHARE ?= 1
+FUZZ_GUIDED_S ?= 300
+
+fuzz: install  # 10 million mutated frames, 100 thousand mutated files, then atheris; FUZZ_SHARE=0.01 for a part of it
+	$(BIN)/python -m tests.fuzz --share $(FUZZ_SHARE)
+	@test -d .venv-fuzz/atheris || $(BIN)/python -m pip install --quiet --disable-pip-version-check --target .venv-fuzz --no-deps \
+	    --require-hashes -r requirements-fuzz.txt || echo "atheris does not install here: the seeded mutator alone"
+	@if test -d .venv-fuzz/atheris; then \
+	    PYTHONPATH=.venv-fuzz $(BIN)/python -m tests.fuzz.guided -max_total_time=$(FUZZ_GUIDED_S) -verbosity=0; fi
+
 clean:
-	rm -rf .venv $(CLIENTS) build *.egg-info
+	rm -rf .venv .venv-fuzz $(CLIENTS) build *.egg-info

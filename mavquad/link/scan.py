@@ -17,6 +17,7 @@ STAMP = 8
 STX_V1 = 0xFE
 STX_V2 = 0xFD
 SIGNATURE_LENGTH = 13
+_LAST = np.uint64(2**63 - 1)  # a stamp past it is read as this one: stamps are signed
 _HASH = 40503  # 2^16 over the golden ratio: keys of 40 bits stay within int64
 
 
@@ -177,7 +178,7 @@ def find(data, place, crc_extra, keys, slots, key_of, count, t_us, where, stream
         stamp = np.uint64(0)
         for k in range(STAMP):
             stamp = stamp << np.uint64(8) | np.uint64(data[at + k])
-        t_us[n], where[n], stream[n] = np.int64(stamp), start, slots[slot]
+        t_us[n], where[n], stream[n] = np.int64(min(stamp, _LAST)), start, slots[slot]
         n += 1
         if stx == STX_V2 and data[start + 2] & 1:
             signed += 1

@@ -16,6 +16,7 @@ from mavquad.errors import LogError
 from mavquad.wire import Frame
 
 STAMP = 8
+LAST_US = (1 << 63) - 1  # a stamp past it is read as this one, here and by columns, where stamps are signed
 _CHUNK = 1 << 20
 _RECORD = STAMP + wire.MAX_FRAME
 _STX = re.compile(rb"[\xfd\xfe]")
@@ -118,7 +119,7 @@ class Reader:
             if frame is not None:
                 self.junk_bytes += base + at - sync_at
                 self.messages += 1
-                yield int.from_bytes(data[at : at + STAMP], "big"), frame
+                yield min(int.from_bytes(data[at : at + STAMP], "big"), LAST_US), frame
                 at += STAMP + len(frame.raw)
                 sync_at, synced = base + at, True
                 continue
