@@ -198,7 +198,8 @@ def test_two_vehicles_and_a_clock_that_runs_backwards_are_kept_as_they_are():
     stamps = [5, 4, 9, 2**63, 0, 1]
     data = b"".join(t.to_bytes(8, "big") + raw for t, raw in zip(stamps, raws, strict=True))
     records, _, _ = drain(data)
-    assert [(t, r.system) for t, r in records] == list(zip(stamps, (1, 2, 1, 2, 1, 2), strict=True))
+    read = [min(t, tlog.LAST_US) for t in stamps]  # as columns have it, whose stamps are signed
+    assert [(t, r.system) for t, r in records] == list(zip(read, (1, 2, 1, 2, 1, 2), strict=True))
 
 
 @pytest.mark.parametrize("tool", ["mavlogdump.py", "mavloss.py", "mavsummarize.py"])
