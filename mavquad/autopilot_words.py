@@ -32,7 +32,8 @@ def hear(heard: Heard, message: Any, now_us: int) -> tuple[Heard, bool]:
     """A STATUSTEXT; True when a text is whole now. A part that got lost leaves the rest to be read without it."""
     words = message.text
     if message.id:
-        words = heard.parts + words if message.id == heard.number else words
+        before = heard.parts if message.id == heard.number else "... " * (message.chunk_seq > 0)
+        words = before + words
         if len(message.text) >= _FULL:  # another part follows
             return heard._replace(number=message.id, parts=words), False
     recent = (*heard.recent[1 - _RECENT :], words)

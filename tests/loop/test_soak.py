@@ -1,0 +1,201 @@
+"""`make soak`: eighty minutes of vehicle time at ten times real time with faults, an independent listener between the programs.
+
+Memory stays flat, clocks do not drift, nothing unflyable is sent, and every frame the listener passed on is in one of the two logs.
+"""
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+import zlib
+from pathlib import Path
+
+import pytest
+
+from mavquad import wire
+from mavquad.link import tlog
+from mavquad.settings import Companion
+from tests.fuzz.targets import judge_outbox
+from tools import flight, fly
+
+MINUTES = float(os.environ.get("MAVQUAD_SOAK_MINUTES", "80"))
+SPEED = 10.0
+SETPOINT = wire.ID["SET_ATTITUDE_TARGET"]
+LINK = {"loss": 0.01, "duplicate": 0.005, "reorder": 0.005, "corrupt": 0.002, "jitter_ms": 5.0}
+
+
+class Tally:
+    """Frames of one direction, by number and by a sum that does not depend on their order."""
+
+    def __init__(self):
+        self.frames = self.sum = 0
+
+    def add(self, raw):
+        self.frames += 1
+        self.sum = (self.sum + zlib.crc32(raw)) & (1 << 64) - 1
+
+    def __eq__(self, other):
+        return (self.frames, self.sum) == (other.frames, other.sum)
+
+    def __repr__(self):
+        return f"{self.frames} frames, sum {self.sum:x}"
+
+
+class Listener:
+    """Stands between the two programs: passes each datagram on, tallies what it passed, judges every setpoint."""
+
+    def __init__(self, port):
+        self.front = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)  # the companion's side
+        self.front.bind(("127.0.0.1", 0))
+        self.back = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.back.connect(("127.0.0.1", port))
+        for sock in (self.front, self.back):
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 23)
+        self.companion = None
+        self.down, self.up, self.setpoints = Tally(), Tally(), 0
+
+    def serve(self, seconds):
+        """What comes within a while."""
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0.0:
+            for sock in select.select([self.front, self.back], [], [], left)[0]:
+                with contextlib.suppress(ConnectionError):
+                    if sock is self.front:
+                        data, self.companion = sock.recvfrom(65536)
+                        self._up(data)
+                        self.back.send(data)
+                    elif self.companion:
+                        data = sock.recv(65536)
+                        self.front.sendto(data, self.companion)
+                        for frame in wire.split(data)[0]:
+                            self.down.add(frame.raw)
+
+    def _up(self, data):
+        for frame in wire.split(data)[0]:
+            self.up.add(frame.raw)
+            if frame.msgid == SETPOINT:
+                self.setpoints += 1
+                judge_outbox(Companion(), [(0, frame.raw)])
+
+    def close(self):
+        self.front.close()
+        self.back.close()
+
+
+def faults(length_s):
+    """Every two minutes something else, all of it flyable."""
+    kinds = (
+        'kind = "ekf_reset", value = [2.0, -1.0, 0.0]',
+        'kind = "push", duration_s = 0.3, force_n = [6.0, 6.0, 0.0]',
+        'kind = "nan", sensor = "gyro", duration_s = 1.0',
+        'kind = "bias", sensor = "accel", duration_s = 5.0, value = [0.3, 0.0, 0.0]',
+        'kind = "motor", motor = 2, effectiveness = 0.9, duration_s = 5.0',
+        'kind = "freeze", sensor = "imu", duration_s = 0.5',
+    )
+    times = range(60, int(length_s) - 20, 120)
+    return "[" + ", ".join(f"{{ t_s = {t}.0, {kinds[i % len(kinds)]} }}" for i, t in enumerate(times)) + "]"
+
+
+def start(run, name, *words):
+    with (run / f"{name}.json").open("wb") as out, (run / f"{name}.txt").open("wb") as err:
+        module = "sitl" if name == "sitl" else "mavquad"
+        command = [sys.executable, "-P", "-m", module, *map(str, words)]
+        return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True)
+
+
+def memory_kib(child):
+    status = Path(f"/proc/{child.pid}/status").read_text()
+    return int(status.split("VmRSS:")[1].split()[0])
+
+
+def received(path, tally, ours):
+    """Adds the frames of a log that came from others, or those that are ours."""
+    if path.exists():
+        with path.open("rb") as stream:
+            for _, frame in tlog.read(stream):
+                if ((frame.system, frame.component) == (1, 191)) == ours:
+                    tally.add(frame.raw)
+
+
+def drift(path):
+    """Vehicle seconds per logged second of the first and of the last quarter of a flight.tlog, by ATTITUDE_QUATERNION."""
+    pairs = []
+    with path.open("rb") as stream:
+        for t_us, frame in tlog.read(stream):
+            if frame.msgid == wire.ID["ATTITUDE_QUATERNION"]:
+                pairs.append((1e-6 * t_us, 1e-3 * wire.decode(frame).time_boot_ms))
+    quarter = len(pairs) // 4
+    parts = pairs[quarter // 4 : quarter], pairs[3 * quarter :]
+    return [(part[-1][1] - part[0][1]) / (part[-1][0] - part[0][0]) for part in parts], pairs[-1][1]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+def test_a_long_flight_with_faults_at_ten_times_real_time(tmp_path, capsys):
+    length_s = 60.0 * MINUTES
+    parser = argparse.ArgumentParser()
+    fly.add_arguments(parser)
+    words = ["hover", "--set", f"path.duration_s={length_s}", "--set", f"flight.max_time_s={length_s + 120}"]
+    for name, value in LINK.items():
+        words += ["--set", f"link.{name}={value}"]
+    run = tmp_path / "run"
+    flight.prepare(run, fly.resolve(parser.parse_args([*words, "--set", f"faults={faults(length_s)}"])))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        port = sock.getsockname()[1]
+    end = ["--exit-when-landed", 2.0, "--max-time", length_s + 120.0]
+    sitl = start(run, "sitl", "--config", run / "sitl.toml", "--endpoint", f"udpin:127.0.0.1:{port}", "--log", run / "sitl.tlog", "--speed", SPEED, *end)  # fmt: skip
+    listener = Listener(port)
+    there = f"udpout:127.0.0.1:{listener.front.getsockname()[1]}"
+    companion = start(run, "companion", "--config", run / "companion.toml", "--endpoint", there, "--run", run, "--engage")
+    seen = []
+    try:
+        while sitl.poll() is None and companion.poll() is None:
+            listener.serve(2.0)
+            with contextlib.suppress(OSError, IndexError):
+                seen.append((flight.vehicle_time_s(run / "flight.trace"), memory_kib(sitl), memory_kib(companion)))
+        listener.serve(0.5)
+    finally:
+        for child in (companion, sitl):
+            if child.poll() is None:
+                child.send_signal(signal.SIGTERM)
+                child.wait(30)
+        listener.close()
+    said = (run / "companion.txt").read_text()
+    report, summary = json.loads((run / "sitl.json").read_text()), json.loads((run / "companion.json").read_text())
+    logged_down, logged_up = Tally(), Tally()
+    for log in sorted(run.glob("*.tlog")):
+        if log.name != "sitl.tlog":
+            received(log, logged_down, ours=False)
+            received(log, logged_up, ours=True)
+    rates, last_s = drift(run / "flight.tlog")
+    with capsys.disabled():
+        print(f"\n{report['sim_time_s']:.0f} s flown at {report['realtime_factor']} x real time, {report['late_s']} s behind")
+        print(f"down: {listener.down} passed on, {logged_down} logged; up: {listener.up} passed on, {logged_up} logged")
+        print(f"{listener.setpoints} setpoints judged; vehicle over logged time {rates[0]:.4f} then {rates[1]:.4f}")
+        print(f"refused {summary['refused']}; counts {summary['counts']}")
+    assert "engaged" in said, said
+    assert report["landed"], said
+    assert not report["crashed"]
+    assert report["sim_time_s"] > length_s
+    asked = 1  # the request to engage is logged, and never was on the wire
+    assert logged_down.frames - asked == listener.down.frames
+    assert logged_up == listener.up
+    assert listener.setpoints == summary["setpoints_sent"] > 50 * length_s
+    assert abs(report["sim_time_s"] - last_s) < 5.0  # the two programs end at one time
+    wanted = report["sim_time_s"] / (report["wall_s"] - report["late_s"] / SPEED)
+    assert math.isfinite(wanted)
+    assert abs(rates[1] / rates[0] - 1.0) < 0.02 or report["late_s"] > 0.0
+    for column, name in ((1, "sitl"), (2, "companion")):
+        early = max(row[column] for row in seen if 30.0 < row[0] < 0.4 * length_s)
+        late = max(row[column] for row in seen if row[0] > 0.75 * length_s)
+        with capsys.disabled():
+            print(f"{name}: {early / 1024:.1f} MiB early, {late / 1024:.1f} MiB late")
+        assert late - early < 8 * 1024
