@@ -163,6 +163,9 @@ def run(mutant: Mutant | None, items: list[pytest.Item], limit_s: float) -> str 
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", action="append", metavar="NAME", help="a module, or module.function (may be repeated)")
+    parser.add_argument(
+        "--tests", action="append", metavar="FILE", help="of tests/unit (may be repeated; default: all of the observer)"
+    )
     parser.add_argument("--every", type=int, default=1, metavar="N", help="every Nth mutant only")
     args = parser.parse_args(argv)
     if os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0"):
@@ -174,7 +177,7 @@ def main(argv: list[str] | None = None) -> int:
     argued = [m for m in chosen if (m.name(), m.text, m.changed) in EQUIVALENT]
     chosen = [m for m in chosen if m not in argued][:: args.every]
     loop = Mutating(chosen)
-    tests = [str(ROOT / "tests" / "unit" / name) for name in TESTS if (ROOT / "tests" / "unit" / name).exists()]
+    tests = [str(ROOT / "tests" / "unit" / name) for name in args.tests or TESTS]
     status = pytest.main(["-m", "not slow", "-p", "no:cacheprovider", "-o", "timeout=0", "--no-header", f"--rootdir={ROOT}", *tests], [loop])  # fmt: skip
     print(f"{len(chosen)} mutants, {loop.noticed} noticed, {len(argued)} compute the same")
     for mutant in loop.survivors:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mavquad import airframe, linalg, quat
+from mavquad import airframe, linalg, quat, signals
 from mavquad.estimate import gsmo, gsmo_core, gsmo_implicit, gsmo_members, gsmo_online, gsmo_relay, gsmo_stream, lie, torque
 from tests.oracles import rates
 
@@ -146,6 +146,25 @@ def test_the_bank_is_the_notes_bank():
         last = bank.best[2]
     assert last > 0.0
     assert expected.rescued > 0
+
+
+def test_the_bank_behind_a_stream_is_the_bank_told_of_every_sample():
+    """Live, from the first sample on: how many there were before, how long ago, how they come."""
+    gains = gsmo.gains(gsmo.Params())
+    state, bank = gsmo.init(gains), None
+    for k, (q, _) in enumerate(motion(7, 5)):
+        state = gsmo.observe(gains, state, signals.Attitude(20_000 * k, q, (0.0, 0.0, 0.0)))
+        if bank is None:
+            bank = gsmo_online.of(gsmo_online.new(q))
+            continue
+        gsmo_online.advance(bank, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.02, 0.01, 2.5 * 0.02)
+        gsmo_online.correct(bank, q, 0.02, 0.02, k)
+        _, w, health = gsmo.read(gains, state, 20_000 * k)
+        np.testing.assert_allclose(w, gsmo_online.mixed(bank)[1], rtol=1e-9)
+        assert health.counts.accepted == k + 1
+        ahead = gsmo_online.of(state.bank.copy())
+        gsmo_online.advance(ahead, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.03, 0.01, 2.5 * 0.02)
+        np.testing.assert_allclose(gsmo.read(gains, state, 20_000 * k + 30_000)[1], gsmo_online.mixed(ahead)[1], rtol=1e-9)
 
 
 def test_members_are_clamped_where_their_torque_states_run_away():
