@@ -134,6 +134,7 @@ def test_slow_loops(controller, seed, period_s):
 CONFIG = 'observers = []\nsettle_s = 0.5\n[path]\nname = "hover"\nduration_s = 60.0\n'
 
 
+@pytest.mark.slow  # of the wall clock: a loaded machine is late by itself
 def test_a_stopped_process_says_that_it_was_late_and_its_log_replays(tmp_path):
     config, run = tmp_path / "companion.toml", tmp_path / "run"
     config.write_text(CONFIG)
