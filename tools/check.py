@@ -105,10 +105,15 @@ def _judge(summary: dict[str, Any], life: Any, measured: dict[str, float], texts
     missing = []
     pid = next(m for m in methods if m["name"] == "pid")
     if not pid["runs"]:
-        missing.append(pid["why"])
+        granted = summary["rates_hz"].get("LOCAL_POSITION_NED", math.nan)
+        silent = granted > 0.0 and not measured.get("LOCAL_POSITION_NED")  # as an estimator that has no origin yet
+        missing.append(
+            pid["why"] + (" (granted, nothing came: is there a position? try again when it can arm)" if silent else "")
+        )
     options = dict(life.params).get("GUID_OPTIONS", math.nan)
     if life.autopilot == 3 and not (math.isfinite(options) and int(options) & _THRUST_AS_THRUST):
-        missing.append(f"GUID_OPTIONS is {options:g}: set bit 3 (add 8), so that thrust is thrust and not a climb rate")
+        value = f"set it to {int(options) | _THRUST_AS_THRUST}" if math.isfinite(options) else "set bit 3 (add 8)"
+        missing.append(f"GUID_OPTIONS is {options:g}: {value}, so that thrust is thrust and not a climb rate")
     if life.autopilot not in _AUTOPILOTS:
         missing.append(f"autopilot {life.autopilot}: neither ArduPilot nor PX4; its modes are not known")
     rates = [
@@ -179,5 +184,7 @@ def show(found: dict[str, Any]) -> None:
     print(f"  sent unasked (Hz): {others or 'nothing'}\n")
     for m in found["methods"]:
         print(f"  {m['kind']:12} {m['name']:34} {'runs' if m['runs'] else 'cannot run: ' + m['why']}")
+    for text in found["texts"]:
+        print(f"it said: {text}")
     for text in found["missing"]:
         print(f"in the way: {text}")

@@ -6,7 +6,6 @@ Memory stays flat, clocks do not drift, nothing unflyable is sent, and every fra
 import argparse
 import contextlib
 import json
-import math
 import os
 import select
 import signal
@@ -161,12 +160,16 @@ def test_a_long_flight_with_faults_at_ten_times_real_time(tmp_path, capsys):
             listener.serve(2.0)
             with contextlib.suppress(OSError, IndexError):
                 seen.append((flight.vehicle_time_s(run / "flight.trace"), memory_kib(sitl), memory_kib(companion)))
-        listener.serve(0.5)
     finally:
         for child in (companion, sitl):
             if child.poll() is None:
                 child.send_signal(signal.SIGTERM)
-                child.wait(30)
+            ends_s = time.monotonic() + 30.0
+            while child.poll() is None and time.monotonic() < ends_s:
+                listener.serve(0.2)  # the last frames are passed on too
+            if child.poll() is None:
+                child.kill()
+        listener.serve(0.2)
         listener.close()
     said = (run / "companion.txt").read_text()
     report, summary = json.loads((run / "sitl.json").read_text()), json.loads((run / "companion.json").read_text())
@@ -190,8 +193,6 @@ def test_a_long_flight_with_faults_at_ten_times_real_time(tmp_path, capsys):
     assert logged_up == listener.up
     assert listener.setpoints == summary["setpoints_sent"] > 50 * length_s
     assert abs(report["sim_time_s"] - last_s) < 5.0  # the two programs end at one time
-    wanted = report["sim_time_s"] / (report["wall_s"] - report["late_s"] / SPEED)
-    assert math.isfinite(wanted)
     assert abs(rates[1] / rates[0] - 1.0) < 0.02 or report["late_s"] > 0.0
     for column, name in ((1, "sitl"), (2, "companion")):
         early = max(row[column] for row in seen if 30.0 < row[0] < 0.4 * length_s)
