@@ -274,11 +274,10 @@ class Companion:
         """Frames of a datagram, or of a piece of a byte stream."""
         for link in self.relays:
             link.copy(data)
-        frames, junk, rest = wire.split(self._rest.pop(address, b"") + data)
-        if rest and not hasattr(self.endpoint, "peers"):
-            self._rest[address] = rest
-        elif rest:
-            junk += len(rest)
+        if isinstance(self.endpoint, UdpEndpoint):
+            frames, junk = wire.datagram(data)
+        else:
+            frames, junk, self._rest[address] = wire.split(self._rest.get(address, b"") + data)
         if junk:
             self.refused["junk bytes"] = self.refused.get("junk bytes", 0) + junk
         return frames

@@ -9,6 +9,7 @@ Source: MAVLink serialisation and signing, https://mavlink.io/en/guide/serializa
 
 import hashlib
 import hmac
+import re
 import struct
 from collections import namedtuple
 from collections.abc import Iterator
@@ -20,6 +21,8 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from mavquad.errors import WireError
 
 STX_V1 = 0xFE
+_STX = re.compile(rb"[\xfd\xfe]")
+_BEGINS = (b"", b"\xfd", b"\xfe")  # what may follow a frame
 STX_V2 = 0xFD
 SIGNED = 0x01  # incompatibility flag
 SIGNATURE_LENGTH = 13
@@ -131,7 +134,7 @@ def split(data: bytes) -> tuple[list[Frame], int, bytes]:
     """Whole frames in `data`, the number of bytes refused, and the rest that may be the beginning of a frame.
 
     A known message with a wrong CRC is refused byte by byte, so that a frame behind junk is still found. One of an unknown
-    id cannot be checked: it is passed on (`decode` will say that it is unknown).
+    id cannot be checked: it is passed on where another frame or nothing follows it (`decode` will say that it is unknown).
     """
     frames: list[Frame] = []
     refused = at = 0
@@ -154,12 +157,18 @@ def split(data: bytes) -> tuple[list[Frame], int, bytes]:
             crc_at = at + 6 + length
             end = crc_at + 2
         else:
-            at, refused = at + 1, refused + 1
+            found = _STX.search(data, at)
+            after = found.start() if found else size
+            at, refused = after, refused + after - at
             continue
         if end > size:
             break
         extra = _EXTRA.get(msgid)
-        if extra is not None and _CRC.unpack_from(data, crc_at)[0] != mcrf4xx(data[at + 1 : crc_at] + extra):
+        if (
+            data[end : end + 1] not in _BEGINS
+            if extra is None
+            else _CRC.unpack_from(data, crc_at)[0] != mcrf4xx(data[at + 1 : crc_at] + extra)
+        ):
             at, refused = at + 1, refused + 1
             continue
         frames.append(tuple.__new__(Frame, (data[at:end], msgid, system, component, seq)))
@@ -169,6 +178,18 @@ def split(data: bytes) -> tuple[list[Frame], int, bytes]:
 
 _EXTRA = {msgid: bytes([cls.crc_extra]) for msgid, cls in dialect.mavlink_map.items()}
 ID_SET = frozenset(ID.values())
+
+
+def datagram(data: bytes) -> tuple[list[Frame], int]:
+    """Whole frames in a datagram, and the number of bytes refused. Nothing follows it: a beginning that goes nowhere is junk too,
+
+    so that a spoiled length hides none of the frames behind it.
+    """
+    frames, refused, rest = split(data)
+    while rest:
+        more, junk, rest = split(rest[1:])
+        frames, refused = frames + more, refused + 1 + junk
+    return frames, refused
 
 
 def decode(frame: Frame) -> Any:

@@ -92,8 +92,8 @@ class Simulation:
     def receive(self, link: Link, data: bytes) -> bool:
         """Bytes of one datagram. True when the answer to the last barrier was in it; before time 0 nothing is kept."""
         answered = False
-        frames, refused, rest = wire.split(data)
-        link.refused += refused + len(rest)
+        frames, refused = wire.datagram(data)
+        link.refused += refused
         for frame in frames:
             if frame.msgid == SETUP_SIGNING:  # it carries a key: kept nowhere
                 self._refuse("a key sent over the link")

@@ -58,15 +58,19 @@ def prepare(run: Path, resolved: Resolved) -> None:
         raise FlightError(f"{run}: cannot be written: {error.strerror}; choose another --run") from None
 
 
-def fly(run: Path, pace: Pace, max_time_s: float, watch: Watcher) -> Flown:
-    """Both programs from a prepared folder until the vehicle has landed. Ctrl-C ends both cleanly and is passed on."""
+def fly(run: Path, pace: Pace, max_time_s: float, watch: Watcher, forward: str = "") -> Flown:
+    """Both programs from a prepared folder until the vehicle has landed; `forward`: an endpoint for a copy of every datagram.
+
+    Ctrl-C ends both cleanly and is passed on.
+    """
+    copies = ["--forward", forward] if forward else []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("127.0.0.1", 0))
         endpoint = f"udpout:127.0.0.1:{sock.getsockname()[1]}"
         begun = time.monotonic()
         sitl = _start(
             run, "sitl", ["--config", str(run / "sitl.toml"), "--socket-fd", str(sock.fileno()), "--log", str(run / "sitl.tlog"),
-                          "--exit-when-landed", repr(_LANDED_S), "--max-time", repr(max_time_s), *pace.sitl()], (sock.fileno(),))  # fmt: skip
+                          "--exit-when-landed", repr(_LANDED_S), "--max-time", repr(max_time_s), *copies, *pace.sitl()], (sock.fileno(),))  # fmt: skip
         companion = _start(
             run, "mavquad", ["--config", str(run / "companion.toml"), "--endpoint", endpoint, "--run", str(run), "--engage",
                              "--signing-state", str(run / "companion.signing"),

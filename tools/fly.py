@@ -1,11 +1,12 @@
 """mavquad fly: one flight of the companion with the simulated autopilot, two processes over UDP; a run folder with its report.
 
-Scenarios: circle (default), ellipse, gusty, hover, line, rectangle, spiral, or a TOML file of your own.
+Scenarios: circle (default), gauntlet (a table of faults, one flight each), ellipse, gusty, hover, line, rectangle, spiral, or a TOML file of your own.
 Changes: --set vehicle.mass=+20%  --set wind.mean_m_s=5  --set path.radius_m=2  --set pid.ki=0.4  --set limits.tilt_deg=30
 
 Example:
   mavquad fly circle --seed 7 --controller pid
   mavquad fly gusty --personality ardupilot --set wind.mean_m_s=7 --json
+  mavquad fly gauntlet --controller eskf-mpc
 """
 
 import argparse
@@ -52,6 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change anything; again for more")
     parser.add_argument("--run", type=Path, metavar="DIR", help="run folder (default: runs/<time>-<scenario>-<seed>)")
     parser.add_argument("--no-report", action="store_true", help="write no report.html")
+    parser.add_argument(
+        "--rows", action="append", metavar="PART", help="of the gauntlet: only rows whose names hold this; again for more"
+    )
     parser.add_argument("--json", action="store_true", help="print summary.json instead of the table")
 
 
@@ -59,6 +63,10 @@ def run(args: argparse.Namespace) -> int:
     """One flight. 0 where it went well, 1 where not."""
     from tools import summary
 
+    if args.scenario == "gauntlet":
+        from tools import gauntlet
+
+        return gauntlet.run(args)
     if args.speed is not None and not 0.01 <= args.speed <= 1000.0:
         raise FlightError(f"--speed {args.speed}: expected 0.01 to 1000 times real time, or no --speed for lockstep")
     name = Path(args.scenario).stem
@@ -73,8 +81,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def one(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
-    """Fly, score and draw into an empty folder; its summary. Raises ConfigError, FlightError."""
+def one(args: argparse.Namespace, folder: Path, forward: str = "") -> dict[str, Any]:
+    """Fly, score and draw into an empty folder; its summary. `forward`: who hears every datagram. Raises ConfigError, FlightError."""
     from mavquad import plan
     from tools import flight, summary, warm
 
@@ -85,7 +93,7 @@ def one(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     signal.signal(signal.SIGTERM, _terminated)
     with Progress(summary.path_duration_s(resolved.companion), quiet=args.json) as progress:
         warm.ensure(f"flight {stages(resolved.companion)}", lambda: warm.flight(resolved), progress.say)
-        flown = flight.fly(folder, flight.Pace(args.speed), max_time_s, progress.watch)
+        flown = flight.fly(folder, flight.Pace(args.speed), max_time_s, progress.watch, forward)
         progress.say("scoring")
         result = summary.summarise(folder, Path(args.scenario).stem, resolved, flown, command(args), args.speed is None)
         if not args.no_report and not flown.problems:

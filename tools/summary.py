@@ -62,7 +62,9 @@ def summarise(run: Path, name: str, resolved: Resolved, flown: Flown, command: s
         "granted_hz": said.get("rates_hz"),
         "delay_s": said.get("delay_s"),
         "solver": said.get("controller") or {},
+        "counts": said.get("counts") or {},
         "landed": bool(sitl.get("landed", False)),
+        "crashed": bool(sitl.get("crashed", False)),
     }
     failures = failures or _failures(result, resolved, lockstep)
     result.update(ok=not failures, failures=failures)

@@ -122,3 +122,15 @@ def test_signatures_agree_with_pymavlink():
     assert wire.verify(frame, key) == (4, 123456789)
     assert wire.verify(frame, bytes(32)) is None
     assert wire.verify(wire.split(_HEARTBEAT)[0][0], key) is None
+
+
+def test_a_spoiled_length_hides_no_frame_behind_it():
+    """A datagram ends where it ends: whatever one byte of the first frame becomes, the second one is found."""
+    first = wire.encode("HEARTBEAT", (2, 12, 81, 0, 3, 3), seq=1, system=1, component=1)
+    second = wire.encode("TIMESYNC", (0, 123_000, 0, 0), seq=2, system=1, component=1)
+    for at in range(len(first)):
+        for value in (0, 1, 0x7F, 0xFD, 0xFE, 0xFF):
+            frames, _ = wire.datagram(first[:at] + bytes([value]) + first[at + 1 :] + second)
+            assert frames[-1].raw == second
+    assert wire.datagram(first + second[:-3]) == (wire.split(first)[0], len(second) - 3)
+    assert wire.datagram(b"\xfd" * 40 + second)[0][-1].raw == second
