@@ -95,6 +95,9 @@ def identify(flight: Flight, fit_s: Span | None = None, check_s: Span | None = N
         if setpoints is None:
             missing.append(f"response from {name}: no {name} in this log; {advice}")
             continue
+        if flight.sticks is not None:
+            missing.append(f"response from {name}: the sticks were swept in this log, not the attitude")
+            continue
         for i, axis in enumerate(AXES):
             got = _try(missing, f"{axis} from {name}", partial(response, flight, setpoints, i, fit_s, check_s))
             if got is not None:

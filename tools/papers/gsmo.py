@@ -1,7 +1,8 @@
 """mavquad paper gsmo: body rates without a gyro: the observer of An et al. 2013, its family and its baselines, in every table.
 
 Scenarios: 8.1 exact start, 8.2 general start and robustness, 8.3 noise and torque (and each method at its best gains), 8.4 order
-of the integrators, 8.5 constant spin, tumble, gap, recording (of a real autopilot: --recording, or the folder MAVQUAD_DATA).
+of the integrators, 8.5 constant spin, tumble, gap, recording (of a real autopilot: --recording, or the folder MAVQUAD_DATA),
+mocap (a flight of ours with motion capture: --flight, the run folder of `mavquad fly circle --attitude mocap`).
 Configurations: G1 ... G9 the family, B1a ... B3 the baselines, online the bank that needs no gains.
 
 Example: mavquad paper gsmo --seeds 1-8 --report gsmo.html
@@ -15,9 +16,9 @@ from pathlib import Path
 from mavquad.errors import ConfigError
 from tools.papers import common
 from tools.papers.common import Row
-from tools.papers.geometric import orders, recording, setup, tables, tuned, words
+from tools.papers.geometric import mocap, orders, recording, setup, tables, tuned, words
 
-SCENARIOS = ("8.1", "8.2", "8.3", "8.4", "8.5", "tumble", "gap", "recording")
+SCENARIOS = ("8.1", "8.2", "8.3", "8.4", "8.5", "tumble", "gap", "recording", "mocap")
 Job = tuple[str, str, tuple[int, ...], str]  # what, configuration, seeds, recording
 
 
@@ -28,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--recording", type=Path, metavar="TLOG", help="a log with ATTITUDE_QUATERNION to judge the observers by"
     )
+    parser.add_argument("--flight", type=Path, metavar="DIR", help="a run folder with motion capture, for the scenario mocap")
 
 
 def plan(scenarios: Sequence[str], configs: Sequence[str] | None, seeds: Sequence[int], log: Path | None) -> list[Job]:
@@ -76,6 +78,7 @@ def work(job: Job) -> list[Row]:
         "8.4": lambda: orders.integrator_order() + orders.norm_drift(),
         "8.5": orders.constant_spin,
         "recording": lambda: recording.judged(recording.read(Path(log))),
+        "mocap": lambda: mocap.judged(Path(log)),
     }
     return one[what]()
 
@@ -86,6 +89,10 @@ def run(args: argparse.Namespace) -> int:
     if log is None and "recording" in scenarios:
         common.progress("no recording: give one with --recording, or set MAVQUAD_DATA to the folder of the recordings")
     jobs = plan(scenarios, args.config, common.parse_seeds(args.seeds), log)
+    if args.flight is not None and "mocap" in scenarios:
+        jobs.append(("mocap", "", (), str(args.flight)))
+    if not jobs:
+        raise ConfigError("nothing to do: the scenario mocap needs --flight, recording needs --recording or MAVQUAD_DATA")
     rows: list[Row] = []
     for i, found in enumerate(common.process_map(work, jobs, processes=args.processes)):
         rows += found

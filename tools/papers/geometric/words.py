@@ -14,6 +14,7 @@ TITLES = {
     "tumble": "tumble  start at (15, -10, 12) rad/s",
     "gap": "gap  largest rate error [rad/s] where samples are missing",
     "recording": "recording  of a real autopilot, against the zero-phase rate",
+    "mocap": "mocap  a flight of ours, torque unknown, against the truth",
 }
 
 
