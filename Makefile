@@ -5,7 +5,7 @@ CLIENTS := .venv-clients
 STAMP := .venv/.installed
 SCENARIO ?= gusty
 
-.PHONY: fly test test-page long soak mutate install test-clients fuzz lint clean
+.PHONY: fly test test-page long soak mutate install test-clients fuzz lint clean mutate-limits
 
 fly: install
 	@$(BIN)/mavquad versus $(SCENARIO)
@@ -31,6 +31,9 @@ test: lint
 
 test-page: install  # every page in a real browser: Debian's package chromium
 	$(BIN)/python -m pytest tests/tools/test_report.py tests/tools/test_replay_page.py tests/tools/test_campaign_report.py -m slow
+
+mutate-limits: install  # each comparison, sign and constant of the last gate changed alone: its tests must notice
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m tests.mutants mavquad.setpoint.limits tests/unit/test_limits_exactly.py tests/unit/test_setpoint.py
 
 long: install  # eighty minutes of vehicle time in lockstep: flat memory, no miss
 	$(BIN)/python -m pytest -s tests/loop/test_long_flight.py -m slow
