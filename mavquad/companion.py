@@ -294,9 +294,12 @@ class Companion:
             begun = clock.monotonic_s()
             self._stamp_us = max(self._stamp_us, clock.wall_us())
             for data, address in arrived:
+                frames = self._frames(data, address)
+                if not frames:  # junk, maybe a flood of it: nothing is done for it
+                    continue
                 before = self.setpoints
                 self._stamp_us = max(self._stamp_us, clock.wall_us())  # of what waited behind others, too: it is that late
-                self.take(self._frames(data, address), address, self._stamp_us)
+                self.take(frames, address, self._stamp_us)
                 self._flush()
                 if self.setpoints > before:
                     self.latency_us.append(1e6 * (clock.monotonic_s() - begun))
