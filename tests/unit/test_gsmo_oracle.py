@@ -191,6 +191,7 @@ def test_the_torque_of_a_motor_behind_its_lag():
     m = torque.mixer(frame)
     spun = torque.spin_up(m, torque.AT_REST, 0, (0.5, 0.4, 0.6, 0.3))
     np.testing.assert_allclose(spun[1], np.array(m.rows) @ np.array(spun[0].thrust_n))
+    assert torque.spin_up(m, torque.AT_REST, 500_000, (0.5, 0.4, 0.6, 0.3))[1] == spun[1]  # whenever the first one comes
     spin, _ = torque.spin_up(m, spun[0], 30_000, (0.7, 0.7, 0.2, 0.1))
     spin, mean = torque.spin_up(m, spin, 50_000, (0.1, 0.2, 0.3, 0.9))
     asked = [np.array(c) * (m.thrust_max_n - m.thrust_min_n) + m.thrust_min_n for c in ((0.5, 0.4, 0.6, 0.3), (0.7, 0.7, 0.2, 0.1), (0.1, 0.2, 0.3, 0.9))]  # fmt: skip

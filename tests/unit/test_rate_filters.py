@@ -35,6 +35,19 @@ def test_zero_phase_does_not_move_a_slow_signal_and_squares_the_attenuation():
     assert twice == pytest.approx(once**2, rel=0.02)
 
 
+def test_zero_phase_goes_on_straight_at_both_ends():
+    ramp = (3.0 + 2.0 * T)[:, None]
+    np.testing.assert_allclose(rate_filters.zero_phase(ramp, 5.0, H), ramp, atol=0.05)
+    assert rate_filters.zero_phase(ramp[:4], 5.0, H).shape == (4, 1)
+
+
+def test_the_model_following_filter_takes_the_torque_of_its_own_half_tick():
+    w = np.zeros((3, 3))
+    a = np.arange(21.0).reshape(7, 3) ** 2
+    found = rate_filters.follow_model_run((0.0, 0.0, 0.0), w, a, 1e-9, H)  # nothing of w is let in
+    np.testing.assert_allclose(found, [[0.0] * 3, H * a[1], H * (a[1] + a[3])], atol=1e-9)
+
+
 def test_the_model_following_filter_does_not_lag_where_the_torque_is_known():
     w = np.stack([np.sin(T), -np.cos(T), 0.0 * T], axis=1)
     half = 0.5 * H * np.arange(2 * len(T) + 1)
