@@ -67,12 +67,11 @@ def step(response: AttitudeResponse, state: State, t_us: int, sent: Quat, measur
     if not state.t_us or not 0.0 < dt_s < 0.5:  # the beginning, or a gap: nothing is known of what happened in it
         return START._replace(sent=((t_us, *axis(sent)),), axis=now, t_us=t_us, rule_rad=state.rule_rad, follows=state.follows)
     acts_us = t_us - round(1e6 * (response.delay_s + delay_s))
-    kept = (*[s for s in state.sent if s[0] > t_us - _KEPT_US], (t_us, *axis(sent)))
-    acting = kept[0]
-    for entry in kept:
-        if entry[0] > acts_us:
-            break
-        acting = entry
+    old = 0
+    while old < len(state.sent) and state.sent[old][0] <= t_us - _KEPT_US:
+        old += 1
+    kept = (*state.sent[old:], (t_us, *axis(sent)))
+    acting = next((entry for entry in reversed(kept) if entry[0] <= acts_us), kept[0])
     x, v = answer(response.natural_frequency_rad_s, response.damping, state.axis, state.rate, acting[1:], dt_s)
     apart = math.hypot(now[0] - x[0], now[1] - x[1])
     lean = max(math.hypot(x[0], x[1]), math.hypot(now[0], now[1]))
