@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mavquad import airframe
-from mavquad.errors import LogError
+from mavquad.errors import ConfigError, LogError
 from mavquad.link.columns import Log, Stream
 from mavquad.link.recording import not_enough_for
 from mavquad.plan import OBSERVERS, stage
@@ -75,7 +75,16 @@ def body_rates(
     keep: Kept | None = None,
     system: int | None = None,
 ) -> dict[str, Any]:
-    """rms of each way to the body rates against the zero-phase rate of the same quaternions [rad/s, x y z]."""
+    """rms of each way to the body rates against the zero-phase rate of the same quaternions [rad/s, x y z].
+
+    Raises ConfigError for an observer of another source: the reference is that of the attitude quaternions.
+    """
+    for spec in observers:
+        if "source=mocap" in spec:
+            raise ConfigError(
+                f"observer {spec!r}: rates are compared on ATTITUDE_QUATERNION here; leave source=mocap away,"
+                " or judge a flight by its truth: mavquad paper gsmo --scenario mocap --flight RUN"
+            )
     source = _attitude_stream(log, system)
     rows = log.rows(source)
     a = rates.attitudes(

@@ -127,3 +127,8 @@ def test_the_whole_recording_gives_the_rates_of_the_issue(recordings, capsys):
     np.testing.assert_allclose(rms["difference, extrapolated half a sample", "-"], [0.0084, 0.0083, 0.0019], rtol=0.03)
     np.testing.assert_allclose(rms["difference, 20 Hz Butterworth", "-"], [0.0475, 0.0472, 0.0026], rtol=0.03)
     assert all(a <= b for a, b in zip(rms["gsmo", "unknown"], rms["difference, extrapolated half a sample", "-"], strict=True))
+
+
+def test_an_observer_of_another_attitude_source_is_refused(capsys):
+    assert tools_main.main(["replay", str(SWEEP), "--observer", "gsmo:source=mocap"]) == 1
+    assert "rates are compared on ATTITUDE_QUATERNION here" in capsys.readouterr().err
