@@ -1,17 +1,15 @@
 """The live shell: endpoint + clock + pipeline + log. It owns everything that ages; nothing below it asks whether it is live.
 
-Every accepted frame is logged before it is acted on, every sent frame before it is sent (frames of a datagram in one write). In lockstep the clock is the barrier:
-all frames of a period carry its stamp (architecture, section 3).
+Every accepted frame is logged before it is acted on, every sent frame before it is sent (frames of a datagram in one write). In
+lockstep the clock is the barrier: all frames of a period carry its stamp (architecture, section 3).
 """
 
 import bisect
 import gc
 import itertools
-import json
 import math
 import os
 import signal
-import struct
 import sys
 from collections import deque
 from pathlib import Path
@@ -27,6 +25,7 @@ from mavquad.link.signing import SETUP_SIGNING, Signer
 from mavquad.link.tlog import Writer
 from mavquad.pipeline import Flight, Plan
 from mavquad.relay import Relay
+from mavquad.run_files import TraceWriter, next_log
 from mavquad.wire import Frame
 
 _MAX_DATAGRAM = 1400
@@ -39,36 +38,12 @@ _TIMESYNC = wire.ID["TIMESYNC"]
 _SETPOINTS = frozenset((wire.ID["SET_ATTITUDE_TARGET"], wire.ID["SET_POSITION_TARGET_LOCAL_NED"]))
 
 
-class TraceWriter:
-    """`flight.trace`: a line of JSON with the column names, then rows of little-endian float64."""
-
-    def __init__(self, path: Path, names: tuple[str, ...]) -> None:
-        self._file = path.open("xb")
-        self._file.write(json.dumps(names).encode() + b"\n")
-        self._row = struct.Struct(f"<{len(names)}d")
-
-    def write(self, row: tuple[float, ...]) -> None:
-        self._file.write(self._row.pack(*row))
-
-    def close(self) -> None:
-        self._file.close()
-
-
 def request(number: int, plan: Plan, seq: int) -> Frame:
     """A local request (engage, land) as the frame it enters by, as if from a ground station."""
     own = plan.settings.link
     fields = (own.system, own.component, number, 0, *(0.0,) * 7)
     raw = wire.encode("COMMAND_LONG", fields, seq=seq, system=255, component=190)
     return wire.split(raw)[0][0]
-
-
-def next_log(run: Path, stem: str) -> Path:
-    """flight.tlog, or flight-2.tlog for a companion that was started again in the same folder."""
-    path, n = run / f"{stem}.tlog", 1
-    while path.exists():
-        n += 1
-        path = run / f"{stem}-{n}.tlog"
-    return path
 
 
 class Companion:

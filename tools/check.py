@@ -57,9 +57,10 @@ def run(args: argparse.Namespace) -> int:
 def check(endpoint_name: str, seconds: float, folder: Path) -> dict[str, Any]:
     """Listen and ask for some seconds. Raises LinkError where nobody speaks MAVLink there."""
     from mavquad import pipeline
-    from mavquad.companion import Companion, next_log
+    from mavquad.companion import Companion
     from mavquad.link.columns import Log
     from mavquad.link.endpoint import open_endpoint
+    from mavquad.run_files import next_log
     from mavquad.settings import Companion as Settings
 
     endpoint = open_endpoint(endpoint_name)
