@@ -6,6 +6,7 @@ import signal
 import socket
 import sys
 import time
+from collections import deque
 from pathlib import Path
 from types import FrameType
 from typing import Any, TextIO
@@ -168,6 +169,7 @@ class Run:
         self._stop = False
         self._began_s = time.monotonic()
         self._late_s = 0.0
+        self._pacing_ms: deque[float] = deque(maxlen=1 << 16)  # how late each slice began
 
     def stop(self, signum: int = 0, frame: FrameType | None = None) -> None:
         """Ask it to end; the log stays whole. Made to be a signal handler."""
@@ -205,6 +207,7 @@ class Run:
             while left_s > 0.0:
                 self.ports.receive(min(left_s, _POLL_S))
                 left_s = due_s - time.monotonic() if not self._stop else 0.0
+            self._pacing_ms.append(1e3 * max(0.0, -left_s))
             ended = until_us == self.sim.period_end_us
             self.sim.run_until(until_us)
             if ended:
@@ -222,6 +225,7 @@ class Run:
             "wall_s": round(wall_s, 3),
             "realtime_factor": round(sim_s / wall_s, 2),
             "late_s": round(self._late_s, 3),
+            "pacing_ms": _quantiles(self._pacing_ms),
             "periods": sim.periods,
             "engaged_periods": sim.engaged_periods,
             "setpoint_misses": sim.misses,
@@ -248,6 +252,14 @@ class Run:
             return True
         ended_us = sim.autopilot.ended_us
         return self._landed_us is not None and not sim.autopilot.armed and 0 <= ended_us <= sim.t_us - self._landed_us
+
+
+def _quantiles(values: deque[float]) -> dict[str, float] | None:
+    """p50, p99 and the largest; None where there are none (lockstep)."""
+    if not values:
+        return None
+    ordered = sorted(values)
+    return {"p50": ordered[len(ordered) // 2], "p99": ordered[int(0.99 * (len(ordered) - 1))], "max": ordered[-1]}
 
 
 def fly(run: Run, speed: float, out: TextIO) -> None:

@@ -61,6 +61,7 @@ def summarise(run: Path, name: str, resolved: Resolved, flown: Flown, command: s
         "refused": {"companion": said.get("refused") or {}, "sitl": sitl.get("frames_refused") or {}},
         "granted_hz": said.get("rates_hz"),
         "delay_s": said.get("delay_s"),
+        "pacing_ms": sitl.get("pacing_ms"),
         "solver": said.get("controller") or {},
         "counts": said.get("counts") or {},
         "landed": bool(sitl.get("landed", False)),
@@ -168,6 +169,9 @@ def table(result: dict[str, Any]) -> list[tuple[str, str]]:
         ),
         ("landed", "yes" if result["landed"] else "no"),
     ]
+    pacing = result.get("pacing_ms")
+    if pacing:
+        rows.append(("pacing", f"p50 {_n(pacing['p50'])}, p99 {_n(pacing['p99'])}, max {_n(pacing['max'])} ms late"))
     force = result.get("disturbance")
     if force:
         follows = f"follows the true one with correlation {_n(force['correlation'])}, {_n(1e3 * force['lag_s'], 0)} ms behind"

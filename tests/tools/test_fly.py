@@ -83,6 +83,8 @@ def test_another_seed_at_a_speed_is_another_flight_that_replays_and_may_fall_sho
     assert "at most 0.0001 m" in other["failures"][0]
     assert shown.err.strip().splitlines()[-1].startswith("mavquad: the flight was not as it should be: position rmse")
     assert other["rmse_m"] != summary["rmse_m"]
+    assert 0.0 <= other["pacing_ms"]["p50"] <= other["pacing_ms"]["p99"] <= other["pacing_ms"]["max"]
+    assert summary["pacing_ms"] is None
     assert tools_main.main(["replay", str(run / "flight.tlog"), "--verify"]) == 0
     assert "bit for bit" in capsys.readouterr().out
 
