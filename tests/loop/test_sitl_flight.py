@@ -261,7 +261,7 @@ def test_a_lockstep_flight_over_udp(sitl_process):
             out.append(frame("SET_ATTITUDE_TARGET", 0, 1, 1, 7, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, HOVER))
         out.append(frame("TIMESYNC", barrier, barrier))
         client.send(b"".join(out))
-    stdout, stderr = process.communicate(timeout=20)
+    stdout, stderr = process.communicate(timeout=90)
     report = json.loads(stdout)
     assert process.returncode == 0, stderr
     assert acks == {400: 0, 22: 0, 176: 0, 21: 0}
@@ -392,7 +392,7 @@ def test_a_bad_wire_is_survived_and_loss_shows_in_the_sequence():
 def test_a_forwarded_copy_holds_both_directions(tmp_path):
     monitor = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     monitor.bind(("127.0.0.1", 0))
-    monitor.settimeout(30.0)
+    monitor.settimeout(90.0)
     probe = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     probe.bind(("127.0.0.1", 0))
     port = probe.getsockname()[1]
@@ -418,7 +418,7 @@ def test_a_forwarded_copy_holds_both_directions(tmp_path):
         assert senders == {(1, 1), (1, 191)}
     finally:
         process.terminate()  # ends cleanly, with its report
-        stdout, stderr = process.communicate(timeout=20)
+        stdout, stderr = process.communicate(timeout=90)
         client.close()
         monitor.close()
     assert process.returncode == 0, stderr
