@@ -1,6 +1,7 @@
 """mavquad fly: one flight of the companion with the simulated autopilot, two processes over UDP; a run folder with its report.
 
-Scenarios: circle (default), gauntlet (a table of faults, one flight each), ellipse, gusty, hover, line, rectangle, spiral, or a TOML file of your own.
+Scenarios: circle (default), ellipse, gusty, hover, line, rectangle, spiral, sweep (excites one axis, for identify), gauntlet (a table of
+faults, one flight each), or a TOML file of your own.
 Changes: --set vehicle.mass=+20%  --set wind.mean_m_s=5  --set path.radius_m=2  --set pid.ki=0.4  --set limits.tilt_deg=30
 
 Example:
