@@ -100,7 +100,7 @@ def _say_which_loop(plan: Plan, f: Flight, command: Command) -> None:
     if ours != f.own_attitude_loop:
         f.own_attitude_loop = ours
         words = "attitude loop closed here" if ours else f"delay {1e3 * f.delay_s:.0f} ms: autopilot's attitude loop"
-        outbox.say(plan, f, f"{words}", 6 if ours else 4)
+        outbox.say(plan, f, words, 6 if ours else 4)
 
 
 def _watch(plan: Plan, f: Flight, t_us: int, q_wxyz: Quat) -> None:
@@ -128,7 +128,7 @@ def _put(plan: Plan, f: Flight, wanted: Setpoint, dt_s: float) -> int:
     last = f.sent or wanted
     setpoint, bits = limits.apply(plan.limits, last, wanted, dt_s)
     f.interventions += bits != 0
-    f.sent, f.sent_us = setpoint, f.now_us
+    f.sent = setpoint
     f.applied_thrust_m_s2 = G_M_S2 * setpoint.thrust / f.hover_thrust
     if f.life.autopilot == lifecycle.ARDUPILOT:
         q = setpoint.q_wxyz
@@ -143,7 +143,7 @@ def _position_setpoint(plan: Plan, f: Flight, demand: Demand) -> None:
     """The autopilot's own loop gets the path: position, velocity, acceleration, heading."""
     stamp_ms = (vehicle_now_us(f) // 1000) & 0xFFFFFFFF
     p = [demand.p_ned_m[i] + f.offset_m[i] for i in range(3)]
-    f.sent, f.sent_us = f.sent or Setpoint((1.0, 0.0, 0.0, 0.0), ZERO3, f.hover_thrust, 7), f.now_us
+    f.sent = f.sent or Setpoint((1.0, 0.0, 0.0, 0.0), ZERO3, f.hover_thrust, 7)
     fields = (stamp_ms, *f.life.target, 1, 1 << 11, *p, *demand.v_ned_m_s, *demand.a_ned_m_s2, demand.yaw_rad, 0.0)
     outbox.send(plan, f, "SET_POSITION_TARGET_LOCAL_NED", fields)
 

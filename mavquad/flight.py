@@ -48,7 +48,6 @@ class Flight:
     anchor_yaw_rad: float
     path_t0_us: int
     sent: Setpoint | None
-    sent_us: int  # vehicle time
     applied_thrust_m_s2: float
     echo: Target | None
     hover_thrust: float
@@ -113,7 +112,7 @@ def forget(plan: Plan, f: Flight) -> None:
     f.controller = plan.controller.module.init(plan.controller.gains)
     f.compensator = plan.compensator.module.init(plan.compensator.gains) if plan.compensator else None
     f.observers = tuple(s.module.init(s.gains) for s in plan.observers)
-    f.now_us = f.control_us = f.sent_us = f.anchor = f.path_t0_us = 0
+    f.now_us = f.control_us = f.anchor = f.path_t0_us = 0
     f.control_gap_us = 0
     f.stamps, f.arrivals, f.behind = {}, {}, 0
     f.newest_arrival_us = f.pace_us = 0

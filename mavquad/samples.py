@@ -28,9 +28,7 @@ def take(plan: Plan, f: Flight, name: str, frame: Frame) -> None:
     except LinkError:
         outbox.count(f, f"{name} refused")
         return
-    observed = (
-        name in _WITH_ATTITUDE and sample.omega_rad_s[0] != sample.omega_rad_s[0]
-    )  # NaN: it sends an attitude without rates
+    observed = name in _WITH_ATTITUDE and math.isnan(sample.omega_rad_s[0])  # it sends an attitude without rates
     if observed and not plan.observers:
         outbox.count(f, f"{name} refused")
         return

@@ -1,6 +1,7 @@
 """What a real ArduCopter does to a companion, met without a change of code: the pipeline against one that is scripted."""
 
 import itertools
+import math
 
 import pytest
 
@@ -155,7 +156,9 @@ def test_thrust_options_that_were_not_read_are_asked_for_again_before_the_flight
     loop.until(lifecycle.OBSERVING)
     a.deaf_to = set()
     loop.take(request(lifecycle.CMD_ENGAGE, loop.plan, 0).raw)
+    assert math.isnan(lifecycle.param(loop.flight.life, "GUID_OPTIONS"))
     loop.until(lifecycle.ENGAGED)
+    assert lifecycle.param(loop.flight.life, "GUID_OPTIONS") == 8.0
 
 
 def test_thrust_options_that_nobody_tells_are_no_reason_to_fly():
