@@ -36,7 +36,8 @@ class Fit(NamedTuple):
 
     structure: Structure
     theta: np.ndarray  # (n,)
-    sd: np.ndarray  # (n,) Cramer-Rao, from the ML residuals
+    sd: np.ndarray  # (n,) with what neighbouring frequencies and outputs share
+    bound: np.ndarray  # (n,) Cramer-Rao, as if every residual stood alone
     correlation: np.ndarray  # (n, n)
     chi2: float
     j: float  # Eq. (17)
@@ -51,7 +52,7 @@ class Fit(NamedTuple):
 
     @property
     def cr_pct(self) -> dict[str, float]:
-        return dict(zip(self.structure.free, 100.0 * self.sd / np.maximum(np.abs(self.theta), 1e-12), strict=True))
+        return dict(zip(self.structure.free, 100.0 * self.bound / np.maximum(np.abs(self.theta), 1e-12), strict=True))
 
     @property
     def trusted(self) -> bool:
@@ -268,13 +269,25 @@ def _finished(task: Problem, theta: np.ndarray, agreeing: int, starts: int, eval
     inverse = np.linalg.pinv(slope / scale)
     cov = inverse @ inverse.T / np.outer(scale, scale)
     chi2 = _chi2(task, float(r @ r))
-    sd = np.sqrt(np.diag(cov))
-    correlation = cov / np.outer(sd, sd)
+    bound = np.sqrt(np.diag(cov))
+    correlation = cov / np.outer(bound, bound)
+    sd = bound
+    if task.response.covariance is not None:
+        pull = inverse / scale[:, None]
+        sd = np.sqrt(np.diag(pull @ _residual_covariance(task) @ pull.T))
     if not CHI2_BAND[0] <= chi2 <= CHI2_BAND[1]:
-        sd = sd * np.sqrt(chi2)
-    return Fit(
-        task.structure, theta, sd, correlation, chi2, cost_of(task, theta, "cifer"), float(r @ r), agreeing, starts, evaluations
-    )
+        sd, bound = sd * np.sqrt(chi2), bound * np.sqrt(chi2)
+    j = cost_of(task, theta, "cifer")
+    return Fit(task.structure, theta, sd, bound, correlation, chi2, j, float(r @ r), agreeing, starts, evaluations)
+
+
+def _residual_covariance(task: Problem) -> np.ndarray:
+    """(2N, 2N) of the ML residuals: circular noise, so real and imaginary parts share half of the complex covariance."""
+    n = task.use.size
+    used = np.flatnonzero(task.use)
+    assert task.response.covariance is not None
+    c = task.response.covariance.reshape(n, n)[np.ix_(used, used)] / np.outer(task.sd, task.sd)
+    return 0.5 * np.block([[c.real, -c.imag], [c.imag, c.real]])
 
 
 # ---- what cannot be told from this record ----------------------------------------------------------------------------

@@ -36,6 +36,7 @@ class Response(NamedTuple):
     h: np.ndarray  # (K, p, m) complex
     sd: np.ndarray  # (K, p, m) standard deviation of the real and of the imaginary part, relative to |h|
     coherence: np.ndarray  # (K, p, m) equivalent coherence, 0..1
+    covariance: np.ndarray | None = None  # (K, p, m, K, p, m) complex, of log h: neighbours share bins, outputs share the gust
 
 
 def checked(records: Sequence[Record], limit: float = 1.0) -> list[str]:
@@ -149,13 +150,16 @@ class _Part(NamedTuple):
     cov: np.ndarray  # (m, m) of the regressors
     s: np.ndarray  # (m + p, m + p) residual covariance
     dof: float
+    share: np.ndarray | None = None  # (m, bins of all records) what every bin gives to g
 
 
 def _local(spectra: list[tuple[np.ndarray, np.ndarray, np.ndarray]], centre: float, half: float) -> _Part:
     m = spectra[0][1].shape[1]
-    rows, wanted = [], []
+    rows, wanted, places, first = [], [], [], 0
     for i, (omega, r, z) in enumerate(spectra):
         inside = np.flatnonzero(np.abs(omega - centre) <= half * (1.0 + 1e-9))
+        places.append(first + inside)
+        first += omega.size
         s = ((omega[inside] - centre) / half)[:, None]
         powers = np.hstack([np.ones_like(s), s, s * s])
         transient = np.zeros((inside.size, 3 * len(spectra)))
@@ -175,10 +179,11 @@ def _local(spectra: list[tuple[np.ndarray, np.ndarray, np.ndarray]], centre: flo
         raise LogError(f"at {centre:.2f} rad/s the records cannot tell the {m} inputs apart: off-axis excitation is missing")
     theta = np.linalg.solve(upper, q.conj().T @ target)
     residual = target - (phi / scale) @ theta
-    inverse = np.linalg.inv(upper) / scale[:, None]
-    cov = inverse @ inverse.conj().T
+    inverse = (np.linalg.inv(upper) / scale[:, None])[:m]
     g = (theta / scale[:, None])[:m].T
-    return _Part(g, cov[:m, :m], residual.T @ residual.conj() / dof, float(dof))
+    share = np.zeros((m, first), dtype=complex)
+    share[:, np.concatenate(places)] = inverse @ q.conj().T
+    return _Part(g, inverse @ inverse.conj().T, residual.T @ residual.conj() / dof, float(dof), share)
 
 
 def _welch_one(records: Sequence[Record], omega: np.ndarray, window_s: float, overlap: float, joint: bool) -> Response:
@@ -223,6 +228,7 @@ def _assemble(dt_s: float, omega: np.ndarray, parts: list[_Part], m: int) -> Res
     h = np.empty((omega.size, p, m), dtype=complex)
     sd = np.empty((omega.size, p, m))
     g2 = np.empty((omega.size, p, m))
+    bins, noises = [], []
     for k, part in enumerate(parts):
         g_u, g_y = part.g[:m], part.g[m:]
         if np.linalg.cond(g_u) > 1e8:
@@ -230,9 +236,29 @@ def _assemble(dt_s: float, omega: np.ndarray, parts: list[_Part], m: int) -> Res
         back = np.linalg.inv(g_u)
         h[k] = g_y @ back
         spread = np.real(np.diag(back.T @ part.cov @ back.conj()))
-        for i in range(p):
-            t = np.concatenate([-h[k, i], np.eye(p)[i]])
-            noise = max(float(np.real(t @ part.s @ t.conj())), 0.0)
-            sd[k, i] = np.sqrt(noise * spread / 2.0) / np.maximum(np.abs(h[k, i]), 1e-300)
+        left = np.hstack([-h[k], np.eye(p)])  # (p, m + p): what is left of [u; y] for each output
+        noise = np.maximum(np.real(np.diag(left @ part.s @ left.conj().T)), 0.0)
+        sd[k] = np.sqrt(np.outer(noise, spread) / 2.0) / np.maximum(np.abs(h[k]), 1e-300)
         g2[k] = 1.0 / (1.0 + part.dof * sd[k] ** 2)
-    return Response(dt_s, omega, h, sd, g2)
+        if part.share is not None:
+            bins.append(back.T @ part.share)
+            noises.append(left @ _root(part.s))
+    covariance = _covariance(h, np.array(bins), np.array(noises)) if bins else None
+    return Response(dt_s, omega, h, sd, g2, covariance)
+
+
+def _covariance(h: np.ndarray, bins: np.ndarray, noises: np.ndarray) -> np.ndarray:
+    """(K, p, m, K, p, m) of log h, from what every bin gives, (K, m, bins), and what noise is on it, (K, p, m + p)."""
+    k, m, _ = bins.shape
+    p = noises.shape[1]
+    flat, loud = bins.reshape(k * m, -1), noises.reshape(k * p, -1)
+    by_bins = (flat @ flat.conj().T).reshape(k, 1, m, k, 1, m)
+    by_noise = (loud @ loud.conj().T).reshape(k, p, 1, k, p, 1)
+    one = 1.0 / np.where(np.abs(h) > 0.0, h, np.inf)
+    return by_bins * by_noise * one[..., None, None, None] * one.conj()[None, None, None]
+
+
+def _root(s: np.ndarray) -> np.ndarray:
+    """The Hermitian square root: roots of covariances that are alike are alike too, as those by Cholesky or eigenvectors are not."""
+    size, axes = np.linalg.eigh(s)
+    return (axes * np.sqrt(np.maximum(size, 0.0))) @ axes.conj().T

@@ -5,7 +5,8 @@ Source: Song et al. 2011 (paper 004), Eqs. (18)-(21).
 Deviations from the paper:
   Eqs. (18)-(21)  nobody measures the rotor states; they are eliminated. For given time constants the moment equation is linear in
                   products of the parameters, every column of H is one experiment, and a grid of time constants gives several starts.
-  Theorem 1       these starts are neither unbiased nor consistent: they are starts.
+  Theorem 1       these starts are neither unbiased nor consistent: they are starts. Noise in the regressors pulls them towards zero,
+                  so a point weighs by its variance, not by its deviation: noisy ones then hardly count.
 """
 
 from typing import NamedTuple
@@ -18,6 +19,7 @@ from mavquad.identify.spectrum import Response
 from mavquad.identify.structures import Structure
 
 HIGHEST_RAD_S = 15.0
+SD_FLOOR = 0.005
 
 
 class Family(NamedTuple):
@@ -57,7 +59,7 @@ class _Rows:
         self.target: list[np.ndarray] = []
 
     def add(self, target: np.ndarray, columns: list[np.ndarray], sd: np.ndarray) -> None:
-        weight = 1.0 / (np.abs(target) * np.maximum(sd, 0.02))
+        weight = 1.0 / (np.abs(target) * np.maximum(sd, SD_FLOOR) ** 2)
         self.phi.append(np.stack(columns, axis=1) * weight[:, None])
         self.target.append(target * weight)
 
@@ -117,7 +119,7 @@ def _rotor(structure: Structure, response: Response, tau_f: float, tau_s: float)
 def _relative(response: Response, index: np.ndarray, j: int, s: np.ndarray, known: np.ndarray) -> np.ndarray:
     """The spread of s u - known relative to its own size, so that the weight is that of s u."""
     whole = s * response.h[index, 0, j]
-    return np.maximum(response.sd[index, 0, j], 0.02) * np.abs(whole) / np.maximum(np.abs(whole - known), 1e-300)
+    return np.maximum(response.sd[index, 0, j], SD_FLOOR) * np.abs(whole) / np.maximum(np.abs(whole - known), 1e-300)
 
 
 _NAMES = {

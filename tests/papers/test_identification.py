@@ -20,7 +20,7 @@ def values(job):
 def test_ref_is_recovered_from_noisy_sweeps_with_an_honest_chi2():
     found = values(Job("noisy", "REF-lat", 105))  # one of the note's two hard seeds
     assert 0.7 <= found["chi2"] <= 1.6
-    assert found["agreeing_starts"] >= 2
+    assert found["agreeing_starts"] >= 5  # of seven, without a guess
     for name in ("Y_v", "L_b", "tau_f"):
         assert found[f"err_pct:{name}"] < 4.0 * found[f"cr_pct:{name}"]
 

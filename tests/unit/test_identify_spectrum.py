@@ -115,6 +115,21 @@ def test_the_spread_lpm_states_is_the_spread_seen(rng):
     assert 0.8 < np.sqrt(np.mean(np.abs(z) ** 2) / 2.0) < 1.25
 
 
+def test_what_neighbouring_frequencies_share_is_stated(rng):
+    """The mean error over close frequencies spreads as the covariance says; taken for independent it would spread a third less."""
+    seen, alone = [], []
+    for _ in range(6):
+        found = spectrum.lpm(open_loop(rng, noise=0.01), spectrum.log_grid(3.0, 6.0, 16))
+        k, p, m = found.h.shape
+        np.testing.assert_allclose(np.diag(found.covariance.reshape(k * p * m, -1)).real, 2.0 * found.sd.ravel() ** 2)
+        mean = np.mean(np.log(found.h / truth(found.omega_rad_s, GAIN)), axis=0)
+        for i, j in np.ndindex(p, m):
+            seen.append(np.abs(mean[i, j]) ** 2 / np.mean(found.covariance[:, i, j, :, i, j]).real)
+            alone.append(np.abs(mean[i, j]) ** 2 / np.mean(2.0 * found.sd[:, i, j] ** 2) * k)
+    assert 0.7 < np.sqrt(np.mean(seen)) < 1.35  # 36 complex samples
+    assert np.sqrt(np.mean(alone)) > 1.4 * np.sqrt(np.mean(seen))
+
+
 def closed_loop(rng):
     """A noisy plant fed back by its own measurement: the input depends on the noise."""
     records = []

@@ -107,7 +107,9 @@ def _recovered(case: Case, job: Job) -> list[Row]:
         return common.row(job.scenario, job.config, job.seed, metric, unit, float(value))
 
     rows = [row(f"err_pct:{name}", "%", value) for name, value in errors_pct(case, found).items()]
-    rows += [row(f"cr_pct:{name}", "%", 100.0 * sd / abs(case.parameters[name])) for name, sd in _spread(found).items()]
+    for kind, spreads in (("cr_pct", found.bound), ("sd_pct", found.sd)):
+        named = zip(found.structure.free, spreads, strict=True)
+        rows += [row(f"{kind}:{name}", "%", 100.0 * sd / abs(case.parameters[name])) for name, sd in named]
     rows += [
         row("chi2", "", found.chi2),
         row("J", "", found.j),
@@ -122,29 +124,21 @@ def _recovered(case: Case, job: Job) -> list[Row]:
     return rows
 
 
-def _spread(found: Fit) -> dict[str, float]:
-    return dict(zip(found.structure.free, found.sd, strict=True))
-
-
 def honesty(rows: Sequence[Row]) -> list[Row]:
-    """Root mean square error over Cramer-Rao bound, over seeds and parameters: 1 where the error bars are honest."""
+    """Root mean square error over the seeds against the median bar, for both kinds: 1 where the error bars are honest."""
     found = []
-    for scenario, config in dict.fromkeys((r["scenario"], r["config"]) for r in rows):
-        values = {
-            (r["seed"], r["metric"]): r["value"]
-            for r in rows
-            if (r["scenario"], r["config"]) == (scenario, config) and r["seed"] is not None
-        }
-        ratios: dict[str, list[float]] = {}
-        for (seed, metric), value in values.items():
-            kind, _, name = metric.partition(":")
-            if kind == "err_pct" and (seed, f"cr_pct:{name}") in values:
-                ratios.setdefault(name, []).append(value / values[seed, f"cr_pct:{name}"])
-        found += [
-            common.row(scenario, config, None, f"rms_error_over_cr:{name}", "", float(np.sqrt(np.mean(np.square(r)))), "rms")
-            for name, r in ratios.items()
-            if len(r) > 1 and scenario != "noise-free"
-        ]
+    for scenario, config in dict.fromkeys((r["scenario"], r["config"]) for r in rows if r["scenario"] != "noise-free"):
+        by_metric: dict[str, list[float]] = {}
+        for r in rows:
+            if (r["scenario"], r["config"]) == (scenario, config) and r["seed"] is not None:
+                by_metric.setdefault(r["metric"], []).append(r["value"])
+        for bar in ("cr", "sd"):
+            for metric, values in by_metric.items():
+                kind, _, name = metric.partition(":")
+                bars = by_metric.get(f"{bar}_pct:{name}", [])
+                if kind == "err_pct" and len(values) > 1 and len(bars) == len(values):
+                    ratio = float(np.sqrt(np.mean(np.square(values))) / np.median(bars))
+                    found.append(common.row(scenario, config, None, f"rms_error_over_{bar}:{name}", "", ratio, "rms"))
     return found
 
 

@@ -14,7 +14,7 @@ def page_of(rows: Sequence[Row], seed: int) -> str:
     """The whole page: `rows` as the command found them, figures from one seed."""
     lead = page.text(
         "Hover models recovered from simulated sweeps. Errors are medians over the seeds; the Cramer-Rao bound beside each says"
-        " what the record can tell. Table 1 is identified as printed: it is not a flyable plant."
+        " what the record can tell at best, sd_pct also counts what neighbouring frequencies and outputs share. Table 1 is identified as printed: it is not a flyable plant."
     )
     return page.page("mavquad: identification (paper 004)", [*_tables(rows), *_figures(seed)], lead)
 
@@ -27,11 +27,12 @@ def _tables(rows: Sequence[Row]) -> list[tuple[str, list[str]]]:
         for config in dict.fromkeys(r["config"] for r in middle if r["scenario"] == scenario):
             own = {r["metric"]: r["value"] for r in middle if (r["scenario"], r["config"]) == (scenario, config)}
             pieces.append(page.text(config, "verdict"))
+            kinds = ("err_pct", "cr_pct", "sd_pct", "rms_error_over_cr", "rms_error_over_sd")
             names = list(dict.fromkeys(m.partition(":")[2] for m in own if m.startswith("err_pct:")))
             if names:
-                kinds = [k for k in ("err_pct", "cr_pct", "rms_error_over_cr") if f"{k}:{names[0]}" in own]
-                pieces.append(page.table(["parameter", *kinds], [[n, *(own.get(f"{k}:{n}") for k in kinds)] for n in names]))
-            rest = [(m, v) for m, v in own.items() if m.partition(":")[0] not in ("err_pct", "cr_pct", "rms_error_over_cr")]
+                shown = [k for k in kinds if f"{k}:{names[0]}" in own]
+                pieces.append(page.table(["parameter", *shown], [[n, *(own.get(f"{k}:{n}") for k in shown)] for n in names]))
+            rest = [(m, v) for m, v in own.items() if m.partition(":")[0] not in kinds]
             pieces.append(page.table(["figure", "value"], rest))
         sections.append((scenario, pieces))
     return sections
