@@ -12,6 +12,7 @@ It stands beside the pipeline because it composes two stages, which do not know 
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Literal, NamedTuple
 
@@ -22,7 +23,7 @@ from mavquad.airframe import Airframe, ModelBounds
 from mavquad.compensate import active_model
 from mavquad.errors import ConfigError
 from mavquad.estimate import asmf, command_line, quad_error
-from mavquad.signals import NAN3, ZERO3, Applied, Attitude, Command, Estimate, Imu, Position, Target, Vec3
+from mavquad.signals import NAN3, ZERO3, Applied, Attitude, Command, Demand, Estimate, Imu, Position, Target, Vec3
 
 G_M_S2 = 9.80665
 GAP_S = 0.5  # a longer silence, or a clock that goes back: begin again
@@ -160,7 +161,13 @@ def observe(gains: Gains, state: State, sample: object) -> State:
 
 
 def step(
-    gains: Gains, state: State, estimate: Estimate, nominal: Command, applied: Applied, t_us: int
+    gains: Gains,
+    state: State,
+    estimate: Estimate,
+    nominal: Command,
+    applied: Applied,
+    t_us: int,
+    demand_at: Callable[[int], Demand] | None = None,
 ) -> tuple[State, Command]:
     """One control tick: the model error up to t_us, and the nominal command corrected by it."""
     active = _finite(nominal.a_ned_m_s2)

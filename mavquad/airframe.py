@@ -5,6 +5,8 @@ import math
 from pathlib import Path
 from typing import Literal
 
+import msgspec
+
 from mavquad import config
 from mavquad.errors import ConfigError
 
@@ -86,6 +88,7 @@ class Airframe(config.Section, frozen=True):
     rotors: Rotors | None = None
     drag: Drag = Drag()
     bounds: ModelBounds = ModelBounds()
+    hover_model: dict[str, float] = msgspec.field(default_factory=dict)  # of a helicopter: derivatives by their names
 
     def __post_init__(self) -> None:
         mass, inertia = self.body.mass_kg, self.body.inertia_kg_m2

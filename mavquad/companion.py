@@ -36,6 +36,7 @@ _RELAY_S = 0.02  # a further link waits no longer for us, however silent the aut
 _MOVED_S = 3.0  # an autopilot silent for so long may come back from another address
 _TIMESYNC = wire.ID["TIMESYNC"]
 _SETPOINTS = frozenset((wire.ID["SET_ATTITUDE_TARGET"], wire.ID["SET_POSITION_TARGET_LOCAL_NED"]))
+_STICKS = wire.ID["SET_ACTUATOR_CONTROL_TARGET"]
 
 
 def request(number: int, plan: Plan, seq: int) -> Frame:
@@ -156,7 +157,8 @@ class Companion:
         self.log.write_all(out)
         for _, raw in out:
             self._to_send.append(raw)
-            self.setpoints += int.from_bytes(raw[7:10], "little") in _SETPOINTS
+            msgid = int.from_bytes(raw[7:10], "little")
+            self.setpoints += msgid in _SETPOINTS or (msgid == _STICKS and flight.sticks is not None)
         for row in flight.trace:
             self.trace.write(row)
         flight.outbox, flight.trace = [], []

@@ -8,7 +8,7 @@ from mavquad.lifecycle import ENGAGED, STREAMING
 from mavquad.link import signals as decode
 from mavquad.plan import Plan
 from mavquad.setpoint import attitude, limits
-from mavquad.signals import NAN3, ZERO3, Applied, Command, Demand, Quat, Setpoint, Vec3
+from mavquad.signals import NAN3, NO_STICKS, ZERO3, Applied, Command, Demand, Quat, Setpoint, Sticks, Vec3
 
 G_M_S2 = attitude.G_M_S2
 _OVER_US = 1_000_000  # after the end of the path, before landing
@@ -59,16 +59,18 @@ def step(plan: Plan, f: Flight, t_us: int, dt_s: float) -> None:
             outbox.send_all(plan, f, module.messages(gains, before, f.controller, t_us, f.life.target))
     if plan.compensator is not None:
         f.compensator, corrected = plan.compensator.module.step(
-            plan.compensator.gains, f.compensator, estimate, nominal, applied, t_us
+            plan.compensator.gains, f.compensator, estimate, nominal, applied, t_us, lambda t: demand_at(plan, f, t)
         )
         if active:
             command = corrected
+            if hasattr(plan.controller.module, "track"):  # its integral must not wind up behind what cancels in its place
+                f.controller = plan.controller.module.track(gains, f.controller, estimate, command.f_cancelled_m_s2)
     bits = 0
     if active:
         if plan.settings.controller == "autopilot":
             _position_setpoint(plan, f, demand)
         else:
-            bits = _put(plan, f, _setpoint(plan, f, command), dt_s)
+            bits = _put(plan, f, _setpoint(plan, f, command), dt_s, command.sticks)
             _say_which_loop(plan, f, command)
             _watch(plan, f, t_us, estimate.q_wxyz)
         if f.life.state == ENGAGED and t_us >= f.path_t0_us + round(1e6 * plan.path.duration_s) + _OVER_US:
@@ -105,7 +107,7 @@ def _say_which_loop(plan: Plan, f: Flight, command: Command) -> None:
 
 def _watch(plan: Plan, f: Flight, t_us: int, q_wxyz: Quat) -> None:
     """Say within a second when an autopilot in our mode does not fly what is sent, and when it does again."""
-    if f.life.state != ENGAGED or f.sent is None:
+    if f.life.state != ENGAGED or f.sent is None or f.sticks is not None:
         f.following = following.START
         return
     follows = f.following.follows
@@ -123,8 +125,8 @@ def _unrotate(q: tuple[float, float, float, float], w: Vec3) -> Vec3:
     return (c * w[0] + s * w[1], -s * w[0] + c * w[1], w[2])
 
 
-def _put(plan: Plan, f: Flight, wanted: Setpoint, dt_s: float) -> int:
-    """Through the gate and on the wire."""
+def _put(plan: Plan, f: Flight, wanted: Setpoint, dt_s: float, sticks: Sticks = NO_STICKS) -> int:
+    """Through the gate and on the wire. Sticks, where there are some, go in place of the attitude, which is kept for the way back."""
     last = f.sent or wanted
     setpoint, bits = limits.apply(plan.limits, last, wanted, dt_s)
     f.interventions += bits != 0
@@ -133,6 +135,11 @@ def _put(plan: Plan, f: Flight, wanted: Setpoint, dt_s: float) -> int:
     if f.life.autopilot == lifecycle.ARDUPILOT:
         q = setpoint.q_wxyz
         f.applied_thrust_m_s2 /= max(0.3, 1.0 - 2.0 * (q[1] * q[1] + q[2] * q[2]))
+    if math.isfinite(sticks[0]):
+        f.sticks, stick_bits = limits.sticks(f.sticks, sticks, dt_s)
+        outbox.send(plan, f, "SET_ACTUATOR_CONTROL_TARGET", decode.stick_setpoint(vehicle_now_us(f), *f.life.target, f.sticks))
+        return stick_bits
+    f.sticks = None
     stamp_ms = (vehicle_now_us(f) // 1000) & 0xFFFFFFFF
     f.setpoints = (*f.setpoints[-24:], (vehicle_now_us(f), setpoint.q_wxyz[1], setpoint.q_wxyz[2]))
     outbox.send(plan, f, "SET_ATTITUDE_TARGET", decode.attitude_setpoint(stamp_ms, *f.life.target, setpoint))

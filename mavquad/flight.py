@@ -9,7 +9,7 @@ from mavquad.errors import ConfigError
 from mavquad.lifecycle import Life
 from mavquad.plan import Plan
 from mavquad.setpoint.attitude import G_M_S2
-from mavquad.signals import ZERO3, Estimate, Position, Setpoint, Target, Vec3
+from mavquad.signals import ZERO3, Estimate, Position, Setpoint, Sticks, Target, Vec3
 
 
 class Flight:
@@ -48,6 +48,7 @@ class Flight:
     anchor_yaw_rad: float
     path_t0_us: int
     sent: Setpoint | None
+    sticks: Sticks | None  # as last sent; None: attitude and thrust are
     applied_thrust_m_s2: float
     echo: Target | None
     hover_thrust: float
@@ -121,6 +122,7 @@ def forget(plan: Plan, f: Flight) -> None:
     f.delay_echo_s, f.setpoints = math.nan, ()
     f.own_attitude_loop = None
     f.sent, f.echo, f.applied_thrust_m_s2 = None, None, G_M_S2
+    f.sticks = None
     f.lateness_us, f.late_us = 1 << 62, 0
     f.late_s, f.slow, f.catching_up, f.skipped_s, f.put_us = 0.0, 0, False, 0.0, 0
     f.following = following.START

@@ -30,6 +30,7 @@ CONTROLLERS = {
     "sweep": ("mavquad.sweep_flight", "direct"),  # excites for identification
 }
 COMPENSATORS = {"asmf": "mavquad.active_flight"}
+HELICOPTER_COMPENSATORS = {"asmf": "mavquad.active_helicopter"}
 OBSERVERS = {"gsmo": "mavquad.estimate.gsmo"}
 
 
@@ -111,9 +112,13 @@ def build(settings: Companion, airframe: Airframe | None = None) -> Plan:
             "compensator: the autopilot's own position loop takes positions, nothing that can be corrected; use pid"
         )
     observers = tuple(stage("observer", spec, OBSERVERS, tune, airframe) for spec in settings.observers)
+    correcting = HELICOPTER_COMPENSATORS if airframe.kind == "helicopter" else COMPENSATORS
     compensator = (
-        stage("compensator", settings.compensator, COMPENSATORS, tune, airframe) if settings.compensator != "none" else None
+        stage("compensator", settings.compensator, correcting, tune, airframe) if settings.compensator != "none" else None
     )
+    control_hz = settings.control_hz
+    if compensator is not None and hasattr(compensator.module, "control_hz"):
+        control_hz = min(control_hz, compensator.module.control_hz(compensator.gains))
     estimator_stage = stage("estimator", estimator, ESTIMATORS, tune, airframe)
     controller_stage = stage(
         "controller", settings.controller, {settings.controller: module}, _with_loop(settings, module), airframe
@@ -127,7 +132,7 @@ def build(settings: Companion, airframe: Airframe | None = None) -> Plan:
         controller_stage,
         compensator,
         observers,
-        round(1e6 / settings.control_hz),
+        round(1e6 / control_hz),
         _samples((estimator_stage, controller_stage, compensator, *observers)),
         publish.trace_names(tuple(s.label for s in observers), compensator.module if compensator else None),
         tuple(adrc_checks.enforce(_checks(estimator_stage, controller_stage))),
@@ -158,7 +163,12 @@ def _with_loop(settings: Companion, module: str) -> dict[str, dict[str, Any]]:
 
 
 _ALWAYS = ("ATTITUDE_QUATERNION", "ATTITUDE", "LOCAL_POSITION_NED", "ATTITUDE_TARGET")
-_ONLY_WHERE_USED = {"Imu": "HIGHRES_IMU", "Mocap": "ATT_POS_MOCAP", "Motors": "SERVO_OUTPUT_RAW"}
+_ONLY_WHERE_USED = {
+    "Imu": "HIGHRES_IMU",
+    "Mocap": "ATT_POS_MOCAP",
+    "Motors": "SERVO_OUTPUT_RAW",
+    "Controls": "ACTUATOR_CONTROL_TARGET",
+}
 
 
 def _samples(stages: tuple[Stage | None, ...]) -> dict[int, str]:

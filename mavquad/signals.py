@@ -9,8 +9,10 @@ from typing import NamedTuple
 
 Vec3 = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
+Sticks = tuple[float, float, float, float]  # of a helicopter, -1..1: roll (lat), pitch (lon), yaw (ped), throttle (col)
 ZERO3: Vec3 = (0.0, 0.0, 0.0)
 NAN3: Vec3 = (math.nan, math.nan, math.nan)
+NO_STICKS: Sticks = (math.nan, math.nan, math.nan, math.nan)
 
 
 # ---- samples: what the autopilot says -------------------------------------------------------------------------------
@@ -59,6 +61,13 @@ class Target(NamedTuple):
     omega_rad_s: Vec3
     thrust: float  # collective, 0..1
     type_mask: int
+
+
+class Controls(NamedTuple):
+    """A helicopter's sticks as applied, the inner loop's share included (ACTUATOR_CONTROL_TARGET)."""
+
+    t_us: int
+    sticks: Sticks
 
 
 # ---- between the stages ------------------------------------------------------------------------------------------------
@@ -110,6 +119,7 @@ class Command(NamedTuple):
     yaw_rate_rad_s: float
     omega_rad_s: Vec3
     f_cancelled_m_s2: Vec3  # the disturbance this command already cancels (zero where none)
+    sticks: Sticks = NO_STICKS  # of a helicopter: sent in place of attitude and thrust
 
 
 class Setpoint(NamedTuple):

@@ -227,7 +227,9 @@ class _Stepper:
             self.compensator = module.observe(self.compensator_gains, self.compensator, self.next)
             self.next = next(self.events, None)
         silent = Applied(t_us, (math.nan,) * 4, math.nan, NAN3, 0.0)  # what acted is the record's own target, never ours
-        self.compensator, corrected = module.step(self.compensator_gains, self.compensator, estimate, command, silent, t_us)
+        self.compensator, corrected = module.step(
+            self.compensator_gains, self.compensator, estimate, command, silent, t_us, self.demand
+        )
         return corrected  # type: ignore[no-any-return]
 
 

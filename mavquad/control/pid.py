@@ -126,3 +126,12 @@ def step(gains: Gains, state: State, estimate: Estimate, demand: Demand, preview
     drag = drag_at(gains, estimate.v_ned_m_s)
     cancelled = (-integral[0] - drag[0], -integral[1] - drag[1], -integral[2] - drag[2])
     return State(integral), Command(a, demand.yaw_rad, demand.yaw_rate_rad_s, NAN3, cancelled)
+
+
+def track(gains: Gains, state: State, estimate: Estimate, cancelled_m_s2: Vec3) -> State:
+    """The integral as it stands for what a compensator cancels in its place: it cannot wind up, and it takes over without a bump."""
+    drag, most = drag_at(gains, estimate.v_ned_m_s), gains.integral_max_m_s2
+    if gains.ki == 0.0:
+        return state
+    integral = tuple(clip(-f - d, -most, most) for f, d in zip(cancelled_m_s2, drag, strict=True))
+    return State(integral if all(map(math.isfinite, integral)) else state.integral_m_s2)

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from typing import Any
 
 from mavquad.errors import LinkError
-from mavquad.signals import Attitude, Imu, Mocap, Motors, Position, Quat, Setpoint, Target
+from mavquad.signals import Attitude, Controls, Imu, Mocap, Motors, Position, Quat, Setpoint, Target
 
-Sample = Attitude | Imu | Mocap | Motors | Position | Target
+Sample = Attitude | Controls | Imu | Mocap | Motors | Position | Target
 _SERVO_WRAP_US = 1 << 32
 
 
@@ -90,6 +90,13 @@ def target(m: Any) -> Target:
     return Target(1000 * m.time_boot_ms, q, (m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate), m.thrust, m.type_mask)
 
 
+def controls(m: Any) -> Controls:
+    """ACTUATOR_CONTROL_TARGET (#140): us; the first four of its controls are a helicopter's sticks."""
+    lat, lon, ped, col = (float(x) for x in m.controls[:4])
+    _finite("ACTUATOR_CONTROL_TARGET", m.time_usec, "us", lat, lon, ped, col)
+    return Controls(m.time_usec, (lat, lon, ped, col))
+
+
 DECODERS: dict[str, Callable[[Any], Sample]] = {
     "ATTITUDE_QUATERNION": attitude_quaternion,
     "ATTITUDE": attitude,
@@ -98,6 +105,7 @@ DECODERS: dict[str, Callable[[Any], Sample]] = {
     "LOCAL_POSITION_NED": position,
     "SERVO_OUTPUT_RAW": motors,
     "ATTITUDE_TARGET": target,
+    "ACTUATOR_CONTROL_TARGET": controls,
 }
 
 
@@ -112,6 +120,11 @@ def attitude_setpoint(time_boot_ms: int, system: int, component: int, setpoint: 
     w = setpoint.omega_rad_s
     rates = (0.0, 0.0, 0.0) if setpoint.type_mask & 7 == 7 else w
     return (time_boot_ms, system, component, setpoint.type_mask, setpoint.q_wxyz, *rates, setpoint.thrust, (0.0, 0.0, 0.0))
+
+
+def stick_setpoint(t_us: int, system: int, component: int, sticks: tuple[float, ...]) -> tuple[Any, ...]:
+    """Fields of SET_ACTUATOR_CONTROL_TARGET (#139), group 0: a helicopter's sticks in place of its inner loop."""
+    return (t_us, 0, system, component, (*sticks, 0.0, 0.0, 0.0, 0.0))
 
 
 def float_of_int(value: int, kind: int) -> float:

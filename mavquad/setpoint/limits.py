@@ -10,9 +10,10 @@ from typing import NamedTuple
 from mavquad import config, quat
 from mavquad.errors import ConfigError
 from mavquad.jit import kernel
-from mavquad.signals import Quat, Setpoint, Vec3
+from mavquad.signals import Quat, Setpoint, Sticks, Vec3
 
-NOT_FINITE, TILT, RATE, THRUST, TURN, THRUST_SLEW = 1, 2, 4, 8, 16, 32
+NOT_FINITE, TILT, RATE, THRUST, TURN, THRUST_SLEW, STICK = 1, 2, 4, 8, 16, 32, 64
+STICK_SLEW_PER_S = 20.0  # of half the travel
 
 
 class Limits(config.Section, frozen=True):
@@ -115,6 +116,21 @@ def apply_kernel(
     elif thrust < gains.thrust_min:
         thrust, bits = gains.thrust_min, bits | THRUST
     return (q_wxyz, (wx, wy, wz), thrust, bits)
+
+
+def sticks(last: Sticks | None, wanted: Sticks, dt_s: float) -> tuple[Sticks, int]:
+    """A helicopter's sticks that may be sent dt after `last` (None: none yet): finite, -1..1, STICK_SLEW_PER_S; and the bits."""
+    bits, out = 0, []
+    most = STICK_SLEW_PER_S * min(max(dt_s, 0.0), 0.1)
+    for i, value in enumerate(wanted):
+        before = last[i] if last is not None else 0.0
+        if not math.isfinite(value):
+            value, bits = before, bits | NOT_FINITE
+        slewed = min(before + most, max(before - most, value)) if last is not None else value
+        given = min(1.0, max(-1.0, slewed))
+        bits |= STICK if given != value else 0
+        out.append(given)
+    return (out[0], out[1], out[2], out[3]), bits
 
 
 def apply(gains: Gains, last: Setpoint, wanted: Setpoint, dt_s: float) -> tuple[Setpoint, int]:

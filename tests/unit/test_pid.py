@@ -1,5 +1,7 @@
 """pd and pid on a point mass behind a second-order attitude response."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -84,3 +86,18 @@ def test_the_drag_fed_forward_counts_as_cancelled_at_the_present_speed():
     np.testing.assert_allclose(np.array(command.a_ned_m_s2) + command.f_cancelled_m_s2, 0.0, atol=1e-12)
     per_speed = (FRAME.drag.linear_n_s_m[0] + 5.0 * FRAME.drag.quadratic_n_s2_m2[0]) / FRAME.body.mass_kg
     np.testing.assert_allclose(command.f_cancelled_m_s2[0], -4.0 * per_speed)
+
+
+def test_behind_a_compensator_the_integral_stands_for_what_is_cancelled_and_does_not_wind_up():
+    gains = pid.gains(pid.Params(), FRAME)
+    state = pid.init(gains)
+    v = (4.0, 0.0, 0.0)
+    estimate = Estimate(0, (-1.0, 0.0, 0.0), v, (1.0, 0.0, 0.0, 0.0), ZERO3, NAN3, NAN3)
+    demand = Demand(0, ZERO3, v, ZERO3, ZERO3, 0.0, 0.0)
+    for _ in range(3000):
+        state, _ = pid.step(gains, state, estimate, demand, None, 0.008)
+        state = pid.track(gains, state, estimate, (-1.5, 0.4, -0.2))
+    drag = pid.drag_at(gains, v)
+    assert state.integral_m_s2 == pytest.approx((1.5 - drag[0], -0.4, 0.2))
+    assert pid.track(gains, state, estimate, (math.nan, 0.0, 0.0)) == state
+    assert pid.track(pd.gains(pd.Params(), FRAME), pid.init(gains), estimate, (9.0, 0.0, 0.0)) == pid.init(gains)
