@@ -36,7 +36,8 @@ def step(plan: Plan, f: Flight, t_us: int, dt_s: float) -> None:
     f.control_us = t_us
     sent = f.sent or Setpoint((1.0, 0.0, 0.0, 0.0), ZERO3, f.hover_thrust, 7)
     q_sent = sent.q_wxyz
-    applied = Applied(t_us, q_sent, f.applied_thrust_m_s2, sent.omega_rad_s if sent.type_mask != 7 else NAN3, f.delay_s)
+    rates = sent.omega_rad_s if sent.type_mask != 7 else NAN3
+    applied = Applied(t_us, q_sent, f.applied_thrust_m_s2, rates, f.delay_s, f.age_s)
     f.estimator, estimate = plan.estimator.module.step(plan.estimator.gains, f.estimator, applied, t_us)
     f.estimate = estimate
     flying = f.life.state in (STREAMING, ENGAGED) and f.anchor > 0

@@ -54,6 +54,8 @@ class Flight:
     hover_thrust: float
     delay_s: float  # measured round trip
     lateness_us: int  # smallest arrival minus stamp seen: what counts as punctual
+    usual_us: float  # mean arrival minus stamp over the last seconds, as the round trip is averaged; NaN: none yet
+    age_s: float  # of this sample, beyond that mean
     late_s: float  # our own lateness, the largest of late
     catching_up: bool  # this sample is old and newer ones wait behind it: not worth a setpoint
     skipped_s: float  # vehicle time that such samples took
@@ -124,6 +126,7 @@ def forget(plan: Plan, f: Flight) -> None:
     f.sent, f.echo, f.applied_thrust_m_s2 = None, None, G_M_S2
     f.sticks = None
     f.lateness_us, f.late_us = 1 << 62, 0
+    f.usual_us, f.age_s = math.nan, 0.0
     f.late_s, f.slow, f.catching_up, f.skipped_s, f.put_us = 0.0, 0, False, 0.0, 0
     f.following = following.START
 

@@ -15,6 +15,7 @@ from mavquad.wire import Frame
 _BEHIND_US, _BEHIND_MANY = 500_000, 30  # no link delivers so many in a row so late: a clock restarted soon after it started
 _LATE_US = 2_000_000  # a stamp further back than this is a restarted clock, not a late message
 _OLD_US = 60_000  # a sample this late, right behind another, comes out of a queue
+_USUAL_S = 2.0  # memory of the mean age, that of the round trip
 _WITH_ATTITUDE = ("ATTITUDE_QUATERNION", "ATTITUDE")
 _DOUBLED_US = 500_000  # ATTITUDE is left out while the quaternion was heard so recently
 
@@ -91,6 +92,7 @@ def _punctual(plan: Plan, f: Flight, t_us: int) -> None:
     offset = f.arrival_us - t_us
     f.lateness_us = min(offset, f.lateness_us + 20)
     late_us = offset - f.lateness_us
+    _age(f, offset)
     f.catching_up = late_us > _OLD_US and f.arrival_us - f.put_us < plan.control_us // 2
     f.late_s = slowing.fade(f.late_s, 1e-6 * late_us, 1e-6 * f.control_gap_us)
     slow = slowing.level(f.slow, f.late_s)
@@ -103,6 +105,13 @@ def _punctual(plan: Plan, f: Flight, t_us: int) -> None:
         f.late_us = f.late_us or f.arrival_us
     else:
         f.late_us = 0
+
+
+def _age(f: Flight, offset_us: int) -> None:
+    """How much older than usual this sample is: what a link's jitter adds to the mean delay. Lateness beyond that is ours."""
+    w = min(1.0, 1e-6 * f.control_gap_us / _USUAL_S)
+    f.usual_us = float(offset_us) if math.isnan(f.usual_us) else f.usual_us + w * (offset_us - f.usual_us)
+    f.age_s = 1e-6 * min(_OLD_US, max(-_OLD_US, offset_us - f.usual_us))
 
 
 def _restarted(plan: Plan, f: Flight) -> None:

@@ -79,6 +79,7 @@ class Applied(NamedTuple):
     thrust_m_s2: float  # specific thrust last sent, or as echoed by the autopilot; > 0 pushes along -z body
     omega_rad_s: Vec3  # rates last sent (NaN where none)
     delay_s: float  # measured command delay, companion to autopilot and back into telemetry
+    age_s: float = 0.0  # of the newest sample when it arrived, less its mean, which is in delay_s
 
 
 class Estimate(NamedTuple):

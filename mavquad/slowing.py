@@ -46,6 +46,8 @@ def _design(module: Any, params: Any, airframe: Airframe, late_s: float) -> Any:
         value = getattr(params, field.name)
         if field.name.startswith("wc") and value > 0.0:
             changed[field.name] = slower * value
+        elif field.name == "delay_down_s":
+            changed[field.name] = value + more_s
         elif field.name == "r_input":  # a bandwidth goes with the fourth root of the weights
             changed[field.name] = value / slower**4
     later = msgspec.structs.replace(response, delay_s=response.delay_s + more_s)

@@ -192,7 +192,7 @@ def step(
     late_s = estimate.delay_s if math.isfinite(estimate.delay_s) else 0.0
     if gains.predict:
         delay_s = min(gains.delay_max_s, gains.delay_s + max(0.0, late_s))
-        p, v, a = ahead(gains.vehicle, p, v, a, rest, state.queue, now_s, delay_s)
+        p, v, a = ahead(gains.vehicle, p, v, a, rest, state.queue, now_s, delay_s, delay_s)
         demand = preview(estimate.t_us + round(1e6 * delay_s))
     wanted, cancelled = law(gains, p, v, a, rest, demand.p_ned_m, demand.v_ned_m_s, demand.a_ned_m_s2, demand.j_ned_m_s3)
     command = limited(gains.vehicle, wanted)

@@ -74,9 +74,9 @@ def drag_along(linear: Vec3, quadratic: Vec3, v: Vec3, a: Vec3) -> tuple[Vec3, V
 
 @kernel
 def ahead(
-    g: Law | Vehicle, p: Vec3, v: Vec3, a: Vec3, rest: Vec3, queue: np.ndarray, now_s: float, delay_s: float
+    g: Law | Vehicle, p: Vec3, v: Vec3, a: Vec3, rest: Vec3, queue: np.ndarray, now_s: float, delay_s: float, span_s: float
 ) -> tuple[Vec3, Vec3, Vec3]:
-    """(p, v, a) after delay_s: each command acts delay_s after its stamp, the acceleration follows it with the lag.
+    """(p, v, a) after span_s: each command acts delay_s after its stamp, the acceleration follows it with the lag.
 
     rest: disturbance beyond the airframe's drag, constant on the way. Exact between the instants at which commands take over,
     but for the drag, which is taken at the beginning of each piece.
@@ -86,10 +86,10 @@ def ahead(
     while i > 0 and queue[i, 0] > now_s - delay_s:
         i -= 1
     at = 0.0  # seconds from now
-    while at < delay_s:
-        until = delay_s
+    while at < span_s:
+        until = span_s
         if i < last:
-            until = min(delay_s, queue[i + 1, 0] + delay_s - now_s)
+            until = min(span_s, queue[i + 1, 0] + delay_s - now_s)
         h = until - at
         if h > 0.0:
             d, _ = drag_along(g.drag_linear_1_s, g.drag_quadratic_1_m, v, (0.0, 0.0, 0.0))
@@ -104,7 +104,7 @@ def ahead(
         at = until
         if i < last:
             i += 1
-        elif at < delay_s:
+        elif at < span_s:
             break
     return p, v, a
 

@@ -7,7 +7,8 @@ both are the same law. A program that fails leaves the closed form, cut to the l
 
 Deviations from the paper:
   input      an acceleration of the thrust vector; the autopilot closes the attitude loop.
-  model      the attitude response belongs to the plant: without it the gain must be a third.
+  model      the attitude response belongs to the plant: without it the gain must be a third. Thrust waits for the link only, so
+             each axis is predicted over its own delay.
   drag       the airframe's drag along the path is fed forward, what the observer saw of it is not cancelled again.
   integral   slow, on the position error: it removes what telemetry's inconsistency leaves.
   rates      on request the turning rate of the commanded attitude goes along, which halves the autopilot's lag.
@@ -56,6 +57,7 @@ class Params:
     r_input: float = 0.022
     lag_s: float = -1.0  # of the attitude behind its setpoint, beyond the delay
     delay_s: float = -1.0  # of the attitude, beyond the measured delay of the link
+    delay_down_s: float = 0.0  # of the thrust, likewise: an autopilot hands it on at once
     predict: bool = True
     jerk_feed_forward: float = 1.0
     drag_feed_forward: float = 1.0
@@ -85,10 +87,10 @@ class Params:
             )
         if not 5.0 <= self.tilt_max_deg <= 60.0:
             raise ConfigError(f"eskf-mpc.tilt_max_deg = {self.tilt_max_deg}: expected 5 to 60")
-        if not (self.lag_s <= 1.0 and self.delay_s <= 1.0 and self.delay_max_s <= 0.6):
+        if not (self.lag_s <= 1.0 and self.delay_s <= 1.0 and 0.0 <= self.delay_down_s <= 1.0 and self.delay_max_s <= 0.6):
             raise ConfigError(
-                f"eskf-mpc: lag_s = {self.lag_s}, delay_s = {self.delay_s}, delay_max_s = {self.delay_max_s}:"
-                " expected at most 1, 1 and 0.6 s"
+                f"eskf-mpc: lag_s = {self.lag_s}, delay_s = {self.delay_s}, delay_down_s = {self.delay_down_s},"
+                f" delay_max_s = {self.delay_max_s}: expected at most 1, 1, 1 and 0.6 s"
             )
 
 
@@ -96,6 +98,7 @@ class Gains(NamedTuple):
     law: Law
     f_max: float
     delay_s: float
+    delay_down_s: float
     delay_max_s: float
     predict: bool
     rates: bool
@@ -104,13 +107,22 @@ class Gains(NamedTuple):
 
 
 class State(NamedTuple):
-    """queue (QUEUE, 4): vehicle time [s] and command, oldest first; integral of the position error; filtered thrust axis."""
+    """queue (QUEUE, 4): when it reaches the vehicle [s] and command, oldest first; integral of the position error; filtered thrust axis."""
 
     queue: np.ndarray
     integral_m_s: Vec3
     axis: Vec3  # NaN before the first command
     programs: constrained.State | None
     steps: int
+
+
+class Delays(NamedTuple):
+    """From an estimate's stamp until what is commanded on it acts, and the horizontal gain for it."""
+
+    link_s: float  # until it reaches the vehicle
+    level_s: float  # until the attitude begins to follow
+    down_s: float
+    k: Vec3
 
 
 def gains(params: Params, airframe: Airframe) -> Gains:
@@ -143,6 +155,7 @@ def gains(params: Params, airframe: Airframe) -> Gains:
         law,
         params.f_max_m_s2,
         delay_s,
+        params.delay_down_s,
         params.delay_max_s,
         params.predict,
         params.rates,
@@ -167,14 +180,17 @@ def step(
     """One control step."""
     g = gains.law
     p, v, f = estimate.p_ned_m, estimate.v_ned_m_s, estimate.f_ned_m_s2
-    delay_s, k = _delay(gains, estimate)
+    delays = _delays(gains, estimate)
+    k = delays.k
     thrust = estimate.thrust_m_s2 if math.isfinite(estimate.thrust_m_s2) else G_M_S2
     a = thrust_acceleration(estimate.q_wxyz, thrust)
     rest = _rest(gains, f, v)
-    at_us = estimate.t_us + round(1e6 * delay_s)
-    if delay_s > 0.0:
-        p, v, a = ahead(g, p, v, a, rest, state.queue, 1e-6 * estimate.t_us, delay_s)
-        demand = preview(at_us)
+    now_s = 1e-6 * estimate.t_us
+    if gains.predict:
+        level = ahead(g, p, v, a, rest, state.queue, now_s, delays.level_s - delays.link_s, delays.level_s)
+        down = ahead(g, p, v, a, rest, state.queue, now_s, delays.down_s - delays.link_s, delays.down_s)
+        p, v, a = _mixed(level[0], down[0]), _mixed(level[1], down[1]), _mixed(level[2], down[2])
+        demand = _demand(preview, estimate.t_us, delays)
     wanted, forward = path_part(g, v, rest, demand.v_ned_m_s, demand.a_ned_m_s2, demand.j_ned_m_s3)
     e_p, e_v, e_a = sub(p, demand.p_ned_m), sub(v, demand.v_ned_m_s), sub(a, wanted)
     slow = scale(-g.integral, state.integral_m_s)
@@ -183,7 +199,7 @@ def step(
     command = slewed(limited(g, free), last, g.slew_m_s3 * max(dt_s, 1e-3))
     programs = state.programs
     if gains.design is not None and programs is not None and k is g.k and math.isfinite(free[0] + free[1] + free[2]):
-        path = _horizon(gains, v, rest, forward, preview, at_us)
+        path = _horizon(gains, v, rest, forward, preview, estimate.t_us, delays)
         path += slow
         error = np.array([e_p, e_v, e_a]).T.copy()
         limits = constrained.Horizon(
@@ -196,7 +212,7 @@ def step(
     integral = grown(state.integral_m_s, e_p, free, command, dt_s) if g.integral > 0.0 else state.integral_m_s
     queue = np.empty_like(state.queue)
     queue[:-1] = state.queue[1:]
-    queue[-1] = 1e-6 * estimate.t_us, *command
+    queue[-1] = max(now_s + delays.link_s, float(queue[-2, 0])), *command  # none overtakes another
     omega, axis = NAN3, state.axis
     if gains.rates:
         axis, omega = turning(command, axis, demand.yaw_rad, demand.yaw_rate_rad_s, max(dt_s, 1e-3))
@@ -207,11 +223,31 @@ def step(
     )
 
 
-def _horizon(gains: Gains, v: Vec3, rest: Vec3, forward: Vec3, preview: Callable[[int], Demand], at_us: int) -> np.ndarray:
+def _demand(preview: Callable[[int], Demand], t_us: int, delays: Delays) -> Demand:
+    """The path where each axis' prediction ends."""
+    level = preview(t_us + round(1e6 * delays.level_s))
+    if delays.down_s == delays.level_s:
+        return level
+    down = preview(t_us + round(1e6 * delays.down_s))
+    return level._replace(
+        p_ned_m=_mixed(level.p_ned_m, down.p_ned_m),
+        v_ned_m_s=_mixed(level.v_ned_m_s, down.v_ned_m_s),
+        a_ned_m_s2=_mixed(level.a_ned_m_s2, down.a_ned_m_s2),
+        j_ned_m_s3=_mixed(level.j_ned_m_s3, down.j_ned_m_s3),
+    )
+
+
+def _mixed(level: Vec3, down: Vec3) -> Vec3:
+    return (level[0], level[1], down[2])
+
+
+def _horizon(
+    gains: Gains, v: Vec3, rest: Vec3, forward: Vec3, preview: Callable[[int], Demand], t_us: int, delays: Delays
+) -> np.ndarray:
     """(HORIZON, 3): the path's part of the command at every stage, looked up at some and interpolated between."""
     knots = [forward]
     for j in range(_KNOT, HORIZON + _KNOT, _KNOT):
-        d = preview(at_us + round(1e6 * STAGE_S * j))
+        d = _demand(preview, t_us + round(1e6 * STAGE_S * j), delays)
         knots.append(path_part(gains.law, v, rest, d.v_ned_m_s, d.a_ned_m_s2, d.j_ned_m_s3)[1])
     return between(np.array(knots), HORIZON, _KNOT)
 
@@ -231,15 +267,15 @@ def diagnostics(state: State) -> dict[str, float]:
     }
 
 
-def _delay(gains: Gains, estimate: Estimate) -> tuple[float, Vec3]:
-    """The delay to predict through and the gain to fly with: a delay out of range is not predicted, but flown gently."""
+def _delays(gains: Gains, estimate: Estimate) -> Delays:
+    """The delays to predict through and the gain to fly with: a delay out of range is not predicted, but flown gently."""
     k = gains.law.k
     if not gains.predict:
-        return 0.0, k
-    total = gains.delay_s + (estimate.delay_s if math.isfinite(estimate.delay_s) else 0.0)
-    if not 0.0 <= total <= gains.delay_max_s:
-        return min(gains.delay_max_s, max(0.0, total)), gains.law.k_soft
-    return total, k
+        return Delays(0.0, 0.0, 0.0, k)
+    link = estimate.delay_s if math.isfinite(estimate.delay_s) else 0.0
+    if not 0.0 <= gains.delay_s + link <= gains.delay_max_s:
+        k, link = gains.law.k_soft, min(max(0.0, gains.delay_max_s - gains.delay_s), max(0.0, link))
+    return Delays(link, gains.delay_s + link, gains.delay_down_s + link, k)
 
 
 def _rest(gains: Gains, f: Vec3, v: Vec3) -> Vec3:

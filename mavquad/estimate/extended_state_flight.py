@@ -294,7 +294,7 @@ def step(gains: Gains, state: State, applied: Applied, t_us: int) -> tuple[State
         state.omega_rad_s,
         (n.x[2] + air[0], e.x[2] + air[1], d.x[2] + air[2]),
         NAN3,
-        state.delay_s,
+        max(0.0, state.delay_s + (applied.age_s if math.isfinite(applied.age_s) else 0.0)),
         state.thrust_m_s2,
     )
 

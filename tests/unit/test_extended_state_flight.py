@@ -78,6 +78,13 @@ def test_without_an_echo_the_thrust_sent_acts_one_delay_later():
     assert state.thrust_m_s2 == pytest.approx(12.0, abs=0.15)  # three rotor lags after the change arrived
 
 
+def test_an_estimate_from_an_older_sample_has_longer_to_wait_for_its_command():
+    state, _, _ = _fly(GAINS, 1.0, ZERO3)
+    for age_s, expected in ((0.015, 0.075), (-0.02, 0.04), (-0.2, 0.0), (math.nan, 0.06)):
+        _, estimate = flight.step(GAINS, state, Applied(state.t_us, quat.IDENTITY, G, NAN3, 0.06, age_s), state.t_us)
+        assert estimate.delay_s == pytest.approx(expected, abs=1e-12)
+
+
 @pytest.mark.parametrize("what", ["nan position", "nan attitude", "twice", "stale", "unknown"])
 def test_bad_samples_change_nothing(what):
     state, _, _ = _fly(GAINS, 1.0, ZERO3)

@@ -223,7 +223,7 @@ def test_the_motion_under_a_command_is_exact(a, u, rest, h):
     vehicle = C.vehicle._replace(drag_linear_1_s=ZERO3, drag_quadratic_1_m=ZERO3)
     queue = iadrc_flight.init(C).queue.copy()
     queue[-1] = -1.0, *u
-    p, v, a2 = lagged.ahead(vehicle, ZERO3, (1.0, 0.0, 0.0), a, rest, queue, 0.0, h)
+    p, v, a2 = lagged.ahead(vehicle, ZERO3, (1.0, 0.0, 0.0), a, rest, queue, 0.0, h, h)
     t = (np.arange(4000) + 0.5) * h / 4000
     for i in range(3):
         lag_s = vehicle.lag_down_s if i == 2 else vehicle.lag_s
@@ -238,7 +238,7 @@ def test_commands_under_way_are_carried_through_each_from_its_time():
     for k in range(10):
         queue[k - 10] = 0.01 * k, float(k), 0.0, 0.0
     quick = C.vehicle._replace(lag_s=1e-6, lag_down_s=1e-6, drag_linear_1_s=ZERO3, drag_quadratic_1_m=ZERO3)
-    _, v, _ = lagged.ahead(quick, ZERO3, ZERO3, ZERO3, ZERO3, queue, 0.0901, 0.05)
+    _, v, _ = lagged.ahead(quick, ZERO3, ZERO3, ZERO3, ZERO3, queue, 0.0901, 0.05, 0.05)
     # at 0.09 command 4 (sent at 0.04) is in force; then 5, 6, 7, 8 for 10 ms each, and 9 takes over as the prediction ends
     assert v[0] == pytest.approx(0.01 * (4 + 5 + 6 + 7 + 8), abs=1e-3)
 

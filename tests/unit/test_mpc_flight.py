@@ -45,7 +45,7 @@ def test_prediction_follows_the_differential_equation(seed, delay_s):
         x = solve_ivp(lambda t, x, u=u: np.concatenate([x[3:6], x[6:] + f, (u - x[6:]) / lag]), (low, high), x, rtol=1e-9).y[
             :, -1
         ]
-    found = lagged.ahead(g, tuple(p), tuple(v), tuple(a), tuple(f), queue, now, delay_s)
+    found = lagged.ahead(g, tuple(p), tuple(v), tuple(a), tuple(f), queue, now, delay_s, delay_s)
     np.testing.assert_allclose(np.concatenate(found), x, atol=1e-6)
 
 
@@ -53,6 +53,28 @@ def test_at_rest_on_the_point_nothing_is_wanted():
     _, command = mpc_flight.step(GAINS, mpc_flight.init(GAINS), _estimate(), HOVER, lambda t: HOVER, 0.008)
     np.testing.assert_allclose(command.a_ned_m_s2, ZERO3, atol=1e-12)
     assert math.isnan(command.omega_rad_s[0])
+
+
+def test_thrust_waits_for_the_link_only_an_attitude_for_its_own_delay_too():
+    """A path that runs away from a vehicle at rest is met where each axis' prediction ends."""
+
+    def runs(t_us):
+        return HOVER._replace(p_ned_m=(1e-6 * t_us, 1e-6 * t_us, 1e-6 * t_us))
+
+    gains = GAINS._replace(design=None, law=LAW._replace(slew_m_s3=1e6))
+    assert gains.delay_s > 0.05
+    at = _estimate(t_us=100_000, delay_s=0.02)
+    _, command = mpc_flight.step(gains, mpc_flight.init(gains), at, runs(at.t_us), runs, 0.008)
+    level = LAW.k[0] * (0.12 + gains.delay_s)
+    np.testing.assert_allclose(command.a_ned_m_s2, (level, level, LAW.k_down[0] * 0.12), rtol=1e-9)
+
+
+def test_a_command_acts_when_it_reaches_the_vehicle_and_overtakes_none():
+    state = mpc_flight.init(GAINS)
+    for i, delay_s in enumerate((0.05, 0.09, 0.03)):
+        at = _estimate(t_us=1_000_000 + 8000 * i, delay_s=delay_s)
+        state, _ = mpc_flight.step(GAINS, state, at, HOVER, lambda t: HOVER, 0.008)
+    np.testing.assert_allclose(state.queue[-3:, 0], [1.05, 1.098, 1.098], rtol=1e-12)
 
 
 def test_a_disturbance_is_cancelled_once():

@@ -4,11 +4,12 @@ import math
 
 import pytest
 
-from mavquad import pipeline, slowing, tunables
+from mavquad import pipeline, slowing, tunables, wire
 from mavquad.control import pid
 from mavquad.settings import Companion
 
 LATE = slowing.LATE_S
+EPOCH_US = 1_700_000_000_000_000
 
 
 def test_the_largest_lateness_is_kept_and_fades():
@@ -49,3 +50,27 @@ def test_gains_changed_in_flight_are_slowed_as_well():
     plan = pipeline.build(Companion(observers=()))
     changed = tunables.change(plan, "PID_DAMPING", 2.0)
     assert changed.slowed[1].kd == pytest.approx(2.0 * plan.slowed[1].kd)
+
+
+def test_a_thrust_is_later_with_the_companion_too():
+    plan = pipeline.build(Companion(controller="eskf-mpc", observers=()))
+    assert [g.delay_down_s for g in plan.slowed] == pytest.approx([0.5 * late_s for late_s in LATE])
+
+
+def _attitude(stamp_ms, seq):
+    fields = (stamp_ms, 1.0, *(0.0,) * 6, (0.0,) * 4)
+    return wire.split(wire.encode("ATTITUDE_QUATERNION", fields, seq=seq, system=1, component=1))[0][0]
+
+
+def test_a_sample_older_than_usual_is_known_to_be():
+    """Attitudes 40 ms old on the mean, some 10 ms more or less: the mean is the link's delay, the rest the sample's age."""
+    plan = pipeline.build(Companion(controller="eskf-mpc", observers=()))
+    f = pipeline.start(plan)
+    f.life = f.life._replace(target=(1, 1))
+    for i in range(1000):
+        jitter_ms = (0, 10, -10)[i % 3]
+        f = pipeline.feed(plan, f, EPOCH_US + 1000 * (5040 + 24 * i + jitter_ms), _attitude(5000 + 24 * i, i & 255))
+        if i > 900:
+            assert f.age_s == pytest.approx(1e-3 * jitter_ms, abs=1e-3)
+    f = pipeline.feed(plan, f, f.arrival_us + 900_000, _attitude(5000 + 24 * 1000, 0))
+    assert f.age_s == 0.06  # what is later than any jitter is not the link's
