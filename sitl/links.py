@@ -27,7 +27,7 @@ class Queue:
         self.due_us = NEVER
         self.counts = dict.fromkeys(("lost", "duplicated", "reordered", "corrupted"), 0)
         self._link = link
-        self._rng = rng
+        self._rng, self._chance = rng, rng.spawn(1)[0]  # of what is put in and of what comes out: neither waits for the other
         self._delay_us, self._jitter_us = round(1000.0 * link.delay_ms), 1000.0 * link.jitter_ms
         self._silences = [(round(1e6 * a), round(1e6 * b)) for a, b in link.silences]
         self.faulty = bool(link.loss or link.duplicate or link.reorder or link.corrupt or self._silences)
@@ -62,7 +62,7 @@ class Queue:
 
     def _spoil(self, t_us: int, raw: bytes) -> list[bytes]:
         """What the wire makes of one frame: none, one or two."""
-        link, rng = self._link, self._rng
+        link, rng = self._link, self._chance
         if any(a <= t_us < b for a, b in self._silences) or (link.loss and rng.random() < link.loss):
             self.counts["lost"] += 1
             return []

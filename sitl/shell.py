@@ -13,7 +13,6 @@ from typing import Any, TextIO
 
 from mavquad.errors import ConfigError, FlightError, LinkError
 from mavquad.link import tlog
-from mavquad.link.endpoint import Patience
 from mavquad.link.signing import Signer
 from sitl.config import Sitl
 from sitl.links import Link
@@ -22,6 +21,7 @@ from sitl.simulation import Simulation
 Address = tuple[str, int]
 ANSWER_S = 10.0  # the partner's time for one barrier
 _POLL_S = 0.2  # how soon a signal is noticed
+_AHEAD = 2  # barriers under way at most
 _SLICE_US = 4_000  # of vehicle time at a speed
 _BEHIND_S = 0.25  # further behind the wall clock than this, the simulation stops trying to catch up
 
@@ -32,22 +32,6 @@ class Port:
     def __init__(self, sock: socket.socket, name: str) -> None:
         self.socket, self.name = sock, name
         self.links: dict[Address, Link] = {}
-        self.patience = Patience()
-
-
-def _next(sock: socket.socket, patience: Patience) -> tuple[bytes, Address]:
-    """The next datagram, waited for."""
-    tries = patience.tries()
-    for _ in tries:
-        try:
-            found = sock.recvfrom(65536, socket.MSG_DONTWAIT)
-        except BlockingIOError:
-            continue
-        patience.learn(True)
-        return found
-    if tries:
-        patience.learn(False)
-    return sock.recvfrom(65536)
 
 
 class Ports:
@@ -95,11 +79,11 @@ class Ports:
             answered |= self._read(port, share)
         return answered
 
-    def send(self) -> None:
-        """What the simulation has for each link."""
+    def send(self, t_us: int) -> None:
+        """What the simulation has for each link by t_us."""
         for port in self._ports:
             for address, link in port.links.items():
-                for data in self._sim.collect(link):
+                for data in self._sim.collect(link, t_us):
                     self._out(port.socket, data, address)
                     for copy, to in self._copies:
                         self._out(copy, data, to)
@@ -122,11 +106,7 @@ class Ports:
         port.socket.settimeout(timeout_s)
         while True:
             try:
-                data, address = (
-                    _next(port.socket, port.patience)
-                    if not flags and timeout_s >= _POLL_S
-                    else port.socket.recvfrom(65536, flags)
-                )
+                data, address = port.socket.recvfrom(65536, flags)
             except (TimeoutError, BlockingIOError):
                 return answered
             except ConnectionError:
@@ -176,23 +156,46 @@ class Run:
         self._stop = True
 
     def lockstep(self) -> None:
-        """Vehicle time stands still until the companion has answered. Raises FlightError when it does not."""
+        """Vehicle time waits for the companion's answers. Raises FlightError when they do not come.
+
+        It waits only where an answer could make a difference: within the wire's delay it runs ahead, and the flight is the same.
+        """
         while self.sim.partner is None and not self._stop:
             self.ports.receive(_POLL_S)
         self._began_s = time.monotonic()
-        while not self._over():
-            self.sim.run_period()
-            self.ports.send()
-            self.sim.record_period()
-            waited_s, since_s = 0.0, time.monotonic()
-            while not self.ports.receive(_POLL_S) and not self._stop:
-                now_s = time.monotonic()
-                waited_s += min(2.0 * _POLL_S, now_s - since_s)  # a machine put to sleep as a whole has not waited
-                since_s = now_s
-                if waited_s > ANSWER_S:
-                    raise FlightError(
-                        f"lockstep: no answer to the barrier of {1e-6 * self.sim.t_us:.3f} s within {ANSWER_S:.0f} s; the flight is aborted"
-                    )
+        sim = self.sim
+        delay_us, period_us, dt_us = round(1e3 * sim.config.link.delay_ms), 1000 * sim.config.period_ms, sim.vehicle.dt_us
+        sent_us = answered_us = sim.t_us  # the last barriers
+        while answered_us < sent_us or not self._over():
+            # What arrives by the next barrier was sent a delay before it; what is said at a barrier arrives a delay after it.
+            ready_us = max(sim.t_us, (sent_us + period_us - delay_us) // dt_us * dt_us)
+            free_us = answered_us + period_us + delay_us
+            if ready_us <= free_us and sent_us - answered_us < _AHEAD * period_us and not self._over():
+                self._run_to(ready_us)
+                sent_us += period_us
+                sim.barrier(sent_us)
+                self.ports.send(sent_us)
+            else:
+                answered_us += period_us
+                self._await_answer(answered_us)
+
+    def _run_to(self, t_us: int) -> None:
+        sim = self.sim
+        while sim.period_end_us <= t_us:
+            sim.run_period()
+            sim.record_period()
+        sim.run_until(t_us)
+
+    def _await_answer(self, barrier_us: int) -> None:
+        waited_s, since_s = 0.0, time.monotonic()
+        while not self.ports.receive(_POLL_S) and not self._stop:
+            now_s = time.monotonic()
+            waited_s += min(2.0 * _POLL_S, now_s - since_s)  # a machine put to sleep as a whole has not waited
+            since_s = now_s
+            if waited_s > ANSWER_S:
+                raise FlightError(
+                    f"lockstep: no answer to the barrier of {1e-6 * barrier_us:.3f} s within {ANSWER_S:.0f} s; the flight is aborted"
+                )
 
     def realtime(self, speed: float) -> None:
         """Nobody waits; vehicle time runs at `speed` times wall time as far as the machine allows."""
@@ -212,7 +215,7 @@ class Run:
             self.sim.run_until(until_us)
             if ended:
                 self.sim.end_period()
-            self.ports.send()
+            self.ports.send(self.sim.t_us)
             if ended:
                 self.sim.record_period()
 
@@ -239,7 +242,7 @@ class Run:
 
     def close(self) -> None:
         """Close sockets and the log."""
-        self.sim.flush()
+        self.sim.flush(last=True)
         self.ports.close()
         if self._writer:
             self._writer.close()

@@ -4,7 +4,10 @@ A shell (`sitl.shell`) opens links, hands over what arrives, moves vehicle time 
 is a function of the configuration and of which bytes came at which vehicle time.
 """
 
+import bisect
+from collections import deque
 from collections.abc import Callable
+from operator import itemgetter
 from typing import Any
 
 from mavquad import wire
@@ -50,7 +53,8 @@ class Simulation:
         self.gyro_name = "gyro_rad_s" if sitl.personality == "px4" else "rates_rad_s"
         self.mocap_age_us = 1000 * sitl.noise.mocap_delay_ms
         self._record = record
-        self._records: list[tuple[int, bytes]] = []
+        self._records: list[tuple[int, bytes]] = []  # sent, and the truth
+        self._heard: list[tuple[int, bytes]] = []
         self._period_us = 1000 * sitl.period_ms
         self._services = Services(self)
         self.faults = Faults(sitl.faults, self)
@@ -60,7 +64,8 @@ class Simulation:
         self._tick_us = TICK_US
         self._stream_us = NEVER
         self._was_engaged = False
-        self._barrier_ns = -1
+        self._barriers: deque[int] = deque()  # those not answered yet, us of vehicle time
+        self._answered = 0  # barriers
         self._first_heartbeat: bytes | None = None
         self._truth_seq = self._texts = 0
 
@@ -90,7 +95,8 @@ class Simulation:
         self._stream_us = min(s.due_us for peer in self.links for s in peer.ordered) if link.ordered else self._stream_us
 
     def receive(self, link: Link, data: bytes) -> bool:
-        """Bytes of one datagram. True when the answer to the last barrier was in it; before time 0 nothing is kept."""
+        """Bytes of one datagram, sent at the oldest barrier that has no answer yet. True when its answer was in it; before time 0
+        nothing is kept."""
         answered = False
         frames, refused = wire.datagram(data)
         link.refused += refused
@@ -98,20 +104,30 @@ class Simulation:
             if frame.msgid == SETUP_SIGNING:  # it carries a key: kept nowhere
                 self._refuse("a key sent over the link")
                 continue
-            if self.lockstep and self.periods <= 1 and self._is_start(link, frame):
+            if self.lockstep and not self._answered and self._is_start(link, frame):
                 continue
+            t_us = self._barriers[0] if self._barriers else self.t_us
+            if self._record is not None:
+                self._heard.append((self.epoch_us + t_us, frame.raw))
             if frame.msgid == _TIMESYNC and link is self.partner and self._answers(frame) and not self._forged(frame):
                 answered = True
+                self._answered += 1
+                self._barriers.popleft()
             else:
-                link.up.put(self.t_us, frame.raw if link.up.faulty else frame)
-            self._log(frame.raw)
+                link.up.put(t_us, frame.raw if link.up.faulty else frame)
         return answered
 
-    def collect(self, link: Link) -> list[bytes]:
-        """Datagrams for this peer: what has come through its wire by now, and the barrier for the lockstep's partner."""
-        frames = link.down.take(self.t_us, lambda item: self._frame(link, item))
-        if link is self.partner and self._barrier_ns == 1000 * self.t_us:
-            frames.append(self._frame(link, ("TIMESYNC", (0, self._barrier_ns))))
+    def barrier(self, t_us: int) -> None:
+        """A barrier of the lockstep goes out with what is collected for t_us."""
+        self._barriers.append(t_us)
+
+    def collect(self, link: Link, t_us: int | None = None) -> list[bytes]:
+        """Datagrams for this peer: what has come through its wire by t_us (by now; later by its delay at most), and the barrier
+        for the lockstep's partner."""
+        t_us = self.t_us if t_us is None else t_us
+        frames = link.down.take(t_us, lambda item: self._frame(link, item, t_us))
+        if link is self.partner and self._barriers and self._barriers[-1] == t_us:
+            frames.append(self._frame(link, ("TIMESYNC", (0, 1000 * t_us)), t_us))
         return links.datagrams(frames)
 
     def send(self, link: Link, name: str, fields: tuple[Any, ...]) -> None:
@@ -136,20 +152,18 @@ class Simulation:
         return (self.t_us // self._period_us + 1) * self._period_us
 
     def run_period(self) -> None:
-        """One whole control period; `record_period` when its frames were collected."""
+        """What is left of a control period; `record_period` comes next, or when its frames were collected."""
         self.run_until(self.period_end_us)
         self.end_period()
 
     def end_period(self) -> None:
-        """At the end of a control period: a setpoint missed, the barrier made."""
+        """At the end of a control period: was a setpoint missed?"""
         self.periods += 1
         engaged = self.autopilot.engaged
         if engaged and self._was_engaged:
             self.engaged_periods += 1
             self.misses += self.autopilot.fresh == 0
         self._was_engaged, self.autopilot.fresh = engaged, 0
-        if self.lockstep:
-            self._barrier_ns = 1000 * self.t_us
 
     def record_period(self) -> None:
         """The truth of this instant, and all that waits for the log: nobody waits for it, so it comes behind what is sent."""
@@ -157,18 +171,21 @@ class Simulation:
             self._write_truth()
             self.flush()
 
-    def flush(self) -> None:
-        """Hand over what is not recorded yet."""
-        if self._record is not None and self._records:
-            self._record(self._records)
-            self._records = []
+    def flush(self, last: bool = False) -> None:
+        """Hand over what is not recorded yet, by stamp; what truth or answers may still come before waits for them."""
+        if self._record is not None and (self._records or self._heard):
+            until_us = NEVER if last else self.epoch_us + min([self.t_us + 1, *self._barriers])
+            records = sorted(self._records + self._heard, key=itemgetter(0))
+            self._record(records[: bisect.bisect_left(records, until_us, key=itemgetter(0))])
+            self._records = [record for record in self._records if record[0] >= until_us]
+            self._heard = [record for record in self._heard if record[0] >= until_us]
 
     def run_until(self, t_us: int) -> None:
         """Move on to t_us (a whole number of loop periods): plant, arrivals, modes and streams at their instants."""
         vehicle, links_, dt_us = self.vehicle, self.links, self.vehicle.dt_us
         now_us = vehicle.t_us
         while now_us < t_us:
-            due_us = min(t_us, self._stream_us, self._tick_us, self.faults.due_us, *[link.up.due_us for link in links_])
+            due_us = min(t_us, self._stream_us, self._tick_us, self.faults.due_us, *[link.up.due_us + 1 for link in links_])
             vehicle.run(max(1, -(-(due_us - now_us) // dt_us)))
             now_us = vehicle.t_us
             if now_us >= self.faults.due_us:
@@ -176,8 +193,8 @@ class Simulation:
             if now_us >= self._reboot_us:
                 self.reboot()
             for link in links_:
-                if link.up.due_us <= now_us:
-                    for arrived in link.up.take(now_us, _as_it_is):
+                if link.up.due_us < now_us:  # what comes at this very instant is seen in the next turn of the loop
+                    for arrived in link.up.take(now_us - 1, _as_it_is):
                         self._arrived(link, arrived)
             if now_us >= self._tick_us:
                 self._tick_us += TICK_US
@@ -246,27 +263,30 @@ class Simulation:
                     next_us = stream.due_us
         self._stream_us = next_us
 
-    def _frame(self, link: Link, item: Any) -> bytes:
+    def _frame(self, link: Link, item: Any, t_us: int) -> bytes:
         if isinstance(item, bytes):  # another's, forwarded as it came
             raw = item
         elif self.signer is None:
             raw = link.encode(item)
         else:
-            raw = self.signer.sign(link.encode(item), self.epoch_us + self.t_us, link.index & 0xFF)
-        self._log(raw)
+            raw = self.signer.sign(link.encode(item), self.epoch_us + t_us, link.index & 0xFF)
+        self._log(raw, t_us)
         return raw
 
-    def _log(self, raw: bytes) -> None:
+    def _log(self, raw: bytes, t_us: int) -> None:
         if self._record is not None:
-            self._records.append((self.epoch_us + self.vehicle.t_us, raw))
+            self._records.append((self.epoch_us + t_us, raw))
 
     def _answers(self, frame: Frame) -> bool:
         m = wire.decode(frame)
-        return bool(m.ts1 == self._barrier_ns and m.tc1 != 0)
+        return bool(self._barriers and m.ts1 == 1000 * self._barriers[0] and m.tc1 != 0)
 
     def _forged(self, frame: Frame) -> bool:
         """Whether a frame of the lockstep itself is not our partner's; its time is that of the barrier."""
-        return self.signer is not None and self.signer.refuses(frame, self.epoch_us + self.t_us, new=False) != ""
+        if self.signer is None:
+            return False
+        t_us = self._barriers[0] if self._barriers else self.t_us
+        return self.signer.refuses(frame, self.epoch_us + t_us, new=False) != ""
 
     def _refuse(self, reason: str) -> None:
         self.refused[reason] = self.refused.get(reason, 0) + 1
@@ -280,7 +300,7 @@ class Simulation:
             if frame.msgid == _HEARTBEAT and frame.component == COMPANION:
                 self.partner = link
             return True
-        if self.periods == 0:
+        if not self._barriers:
             return True
         if link is not self.partner:
             return False
@@ -288,8 +308,9 @@ class Simulation:
             self._first_heartbeat = frame.raw
             return True
         if self._first_heartbeat is not None:
-            link.up.put(self.t_us, self._first_heartbeat)
-            self._log(self._first_heartbeat)
+            link.up.put(self._barriers[0], self._first_heartbeat)
+            if self._record is not None:
+                self._heard.append((self.epoch_us + self._barriers[0], self._first_heartbeat))
             self._first_heartbeat = None
         return False
 
@@ -347,7 +368,7 @@ class Simulation:
         for name, fields in zip(("ODOMETRY", "DEBUG_FLOAT_ARRAY"), telemetry.truth(self), strict=True):
             raw = wire.encode(name, fields, seq=self._truth_seq, system=self.config.system, component=TRUTH_COMPONENT)
             self._truth_seq = (self._truth_seq + 1) & 0xFF
-            self._log(raw)
+            self._log(raw, self.t_us)
 
 
 def _as_it_is(item: Any) -> Any:
