@@ -178,6 +178,7 @@ class Run:
             else:
                 answered_us += period_us
                 self._await_answer(answered_us)
+        self._run_to(sent_us)  # the end of what was begun
 
     def _run_to(self, t_us: int) -> None:
         sim = self.sim
