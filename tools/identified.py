@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 
 from mavquad.errors import LogError
-from mavquad.identify import attitude, noise, timebase, vehicle, verify
+from mavquad.identify import attitude, doubts, noise, timebase, vehicle, verify
 from mavquad.identify.attitude import Axis, Parts, SecondOrder
 from mavquad.identify.noise import Noise
 from mavquad.identify.timebase import Held, Sampled
@@ -103,17 +103,31 @@ def identify(flight: Flight, fit_s: Span | None = None, check_s: Span | None = N
             if got is not None:
                 responses.append(got)
     motion = sampled(flight)
-    thrust = _try(missing, "hover thrust", lambda: vehicle.hover(motion))
-    drag = _try(missing, "drag", lambda: vehicle.drag(motion))
+    foreign = foreign_axes(flight, motion)
+
+    def own(work: Callable[[], T], *streams: str) -> Callable[[], T]:
+        """The work, or a refusal where one of its streams has other axes than expected."""
+
+        def refusing() -> T:
+            for stream in streams:
+                if stream in foreign:
+                    raise LogError(foreign[stream])
+            return work()
+
+        return refusing
+
+    thrust = _try(missing, "hover thrust", own(lambda: vehicle.hover(motion), "accelerometer"))
+    drag = _try(missing, "drag", own(lambda: vehicle.drag(motion), "accelerometer", "velocity"))
     gyro: dict[str, GyroFilter] = {}
     torque: dict[str, Torque] = {}
     for i, axis in enumerate(AXES):
         spans = next((r.found.fitted_from for r in responses if r.axis == axis), flight.flying)
-        if i < 2 and (one := _try(missing, f"gyro filter, {axis}", partial(_gyro, flight, i, spans))) is not None:
+        if i < 2 and (one := _try(missing, f"gyro filter, {axis}", own(partial(_gyro, flight, i, spans), f"rate {axis}"))):
             gyro[axis] = one
-        if (turned := _try(missing, f"torque per command, {axis}", partial(_torque, flight, i, spans))) is not None:
+        about = f"torque per command, {axis}"
+        if turned := _try(missing, about, own(partial(_torque, flight, i, spans), f"gyro {axis}")):
             torque[axis] = turned
-    notes = [*flight.notes, *_doubts(responses)]
+    notes = [*flight.notes, *_recording(flight, responses), *_doubts(responses)]
     hover = _hover(flight, missing)
     return Identified(
         flight, tuple(responses), gyro, thrust, drag, torque, noises(flight), (*missing, *UNKNOWABLE), tuple(notes), hover
@@ -227,6 +241,49 @@ def _try(missing: list[str], what: str, work: Callable[[], T]) -> T | None:
     except LogError as error:
         missing.append(f"{what}: {error}")
         return None
+
+
+def foreign_axes(flight: Flight, motion: vehicle.Motion) -> dict[str, str]:
+    """Streams whose signs are not those of NED and FRD, with what is wrong: told by what they are the derivative of."""
+    air = motion.flying
+    found: dict[str, str] = {}
+    expected = "have the sender use NED and FRD, or convert the log"
+    if flight.imu is not None and doubts.upside_down(motion.accel_m_s2[air, 2]):
+        shown = float(np.median(motion.accel_m_s2[air, 2]))
+        found["accelerometer"] = f"{flight.imu.source}.zacc shows {shown:+.1f} m/s^2 in flight, FRD shows -9.8; {expected}"
+    turn = flight.attitude
+    own = np.column_stack([np.interp(motion.t_s, turn.t_s, turn.rate_rad_s[:, i]) for i in range(3)])
+    for i, axis in enumerate(AXES):
+        for what, source, rates in (
+            ("rate", f"{turn.source}.{axis}speed", own),
+            ("gyro", f"{flight.imu.source}.{'xyz'[i]}gyro" if flight.imu else "", motion.gyro_rad_s),
+        ):
+            if source and doubts.against(rates[air, i], motion.euler_rad[air, i], motion.dt_s):
+                found[f"{what} {axis}"] = f"{source} runs against the change of {turn.source}.{axis}; {expected}"
+    if (there := flight.position) is not None:
+        slow = np.arange(there.t_s[0], there.t_s[-1], 0.4)
+        for i, axis in enumerate("xyz"):
+            p, v = (np.interp(slow, there.t_s, column[:, i]) for column in (there.first, there.second))
+            if doubts.against(v, p, 0.4):
+                found["velocity"] = f"{there.source}.v{axis} runs against the change of {axis}; {expected}"
+    return found
+
+
+def _recording(flight: Flight, responses: Sequence[Response]) -> list[str]:
+    """Gaps, jitter and limits in what was fitted (in flight, where nothing was)."""
+    spans = tuple(span for r in responses for span in r.found.fitted_from) or flight.flying
+    notes: list[str] = []
+    streams = [flight.attitude, *(s for s in (flight.target, flight.imu, flight.position) if s is not None)]
+    for stream in streams:
+        notes += doubts.rhythm(stream.source, stream.t_s, "ask for 50 or 100 Hz over a link that carries it", spans)
+    if flight.motors is not None:
+        notes += doubts.motors_at_limit(*flight.motors, spans)
+    if flight.sent is not None and flight.target is not None:
+        for i, axis in enumerate(AXES[:2]):
+            mine = tuple(s for r in responses if r.axis == axis and r.source == flight.sent.source for s in r.found.fitted_from)
+            pair = [Held(s.t_s, s.euler_rad[:, i]) for s in (flight.sent, flight.target)]
+            notes += doubts.command_cut(axis, pair[0], pair[1], mine)
+    return notes
 
 
 def _doubts(responses: Sequence[Response]) -> list[str]:

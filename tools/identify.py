@@ -134,9 +134,9 @@ def text(found: Identified) -> str:
                 f"drag, {axis:8}    ({_pm(a.value, a.sd, 3)} 1/s + {_pm(b.value, b.sd, 4)} |v| 1/m) v, up to {d.fastest_m_s:.1f} m/s"
             )
     for axis, g in found.gyro.items():
-        lines.append(
-            f"gyro filter {axis:5} {_pm(g.cutoff_hz.value, g.cutoff_hz.sd, 1)} Hz, two poles: rates are {1e3 * g.lag_s:.1f} ms late"
-        )
+        seen = math.isfinite(g.cutoff_hz.value)
+        filtered = f"{_pm(g.cutoff_hz.value, g.cutoff_hz.sd, 1)} Hz, two poles" if seen else "none seen"
+        lines.append(f"gyro filter {axis:5} {filtered}: rates are {1e3 * g.lag_s:.1f} ms late")
     for axis, q in found.torque.items():
         signs = "".join("+" if p > 0 else "-" if p < 0 else "0" for p in q.pattern)
         lines.append(
@@ -165,6 +165,10 @@ def hover_text(h: "Hover") -> list[str]:
         lines.append(f"  {name:10} {value:10.4g} +- {2.0 * sd:.2g}")
     held = ", ".join(f"{name} = {value:.4g}" for name, value in f.structure.fixed.items())
     lines.append(f"  held: {held}")
+    if h.late_s:
+        lines.append(
+            f"  the sticks are stamped {-1e3 * h.late_s:.1f} ms late; taken out before the fit, the delays are what is left"
+        )
     if h.check is not None:
         fits = " ".join(
             f"{o} {p:.0f} % (TIC {t:.2f})" for o, p, t in zip(h.structure.outputs, h.check.fit_pct, h.check.tic, strict=True)

@@ -3,6 +3,9 @@
 The sticks as added are in the companion's SET_ACTUATOR_CONTROL_TARGET (group 3), as applied in the autopilot's
 ACTUATOR_CONTROL_TARGET; the answer in ATTITUDE, HIGHRES_IMU and LOCAL_POSITION_NED, all by the vehicle's stamps. Records are cut where
 the sticks rest; doublets are kept for the check.
+
+A stick is held for 20 ms and stamped some milliseconds late. Between two of its changes the answer is not a delayed one: the yaw rate
+has gone a part of its way. So the delay is fitted first, then the answer is taken at the true changes and everything is fitted again.
 """
 
 from typing import NamedTuple
@@ -30,6 +33,7 @@ PARTS = {  # structure, its sticks in its own order, its outputs: columns of (u,
 }
 EARLIEST_S, LATEST_S = -0.03, 0.1  # of the answer against the stamps of the applied sticks: these may be late themselves
 DOUBTFUL_CHI2 = 5.0  # above: no start was good, more are tried
+ALIGNED_S = 2e-4  # of delay left: the answer is taken where the sticks change
 TIED = 0.98  # correlation above which two parameters cannot be told apart
 Span = tuple[float, float]
 
@@ -43,6 +47,7 @@ class Hover(NamedTuple):
     found: Fit
     check: verify.Check | None  # of doublets that were not fitted
     notes: tuple[str, ...]
+    late_s: float = 0.0  # of the answer against the stamps of the sticks, already taken out; negative: the stamps are late
 
 
 class Swept(NamedTuple):
@@ -64,14 +69,21 @@ def identify(flight: Flight) -> tuple[list[Hover], list[str]]:
     found, missing = [], []
     for name, (structure, sticks, outputs) in PARTS.items():
         try:
-            found.append(part(swept, name, structure, sticks, outputs))
+            first = part(swept, name, structure, sticks, outputs)
+            late_s = float(np.mean(structures.delays_s(first.found.structure, first.found.parameters)))
+            if abs(late_s) > ALIGNED_S:
+                moved = resampled(flight, late_s)
+                first = part(moved, name, structure, sticks, outputs, first.found)._replace(late_s=late_s)
+            found.append(first)
         except LogError as error:
             missing.append(f"{name}: {error}")
     return found, missing
 
 
-def part(swept: Swept, name: str, structure: Structure, sticks: tuple[int, ...], outputs: tuple[int, ...]) -> Hover:
-    """One part of the model. Raises LogError with the stick that was not swept."""
+def part(
+    swept: Swept, name: str, structure: Structure, sticks: tuple[int, ...], outputs: tuple[int, ...], near: Fit | None = None
+) -> Hover:
+    """One part of the model, from the regression's starts unless a fit is `near`. Raises LogError with the stick that was not swept."""
     spans = [(stick, span) for stick, span in swept.sweeps if stick in sticks]
     idle = [STICKS[s] for s in sticks if s not in {stick for stick, _ in spans}]
     if idle:
@@ -79,10 +91,15 @@ def part(swept: Swept, name: str, structure: Structure, sticks: tuple[int, ...],
     records = [_record(swept, span, sticks, outputs) for _, span in spans]
     notes = spectrum.checked(records)
     response = spectrum.lpm(records, GRID_RAD_S)
-    starts = fit.ranked_starts(fit.problem(structure, response), families(structure, response))
     stamped = structures.with_delays(structure, LATEST_S, EARLIEST_S)
+    if near is None:
+        starts = fit.ranked_starts(fit.problem(structure, response), families(structure, response))
+    else:
+        starts = [near.theta[: len(structure.free)]]
     whole = fit.fit(stamped, response, starts=[np.append(theta, np.zeros(len(sticks))) for theta in starts])
-    if whole.chi2 > DOUBTFUL_CHI2:
+    if near is not None:
+        whole = whole._replace(agreeing=near.agreeing, starts=near.starts)
+    elif whole.chi2 > DOUBTFUL_CHI2:
         starts = fit.ranked_starts(fit.problem(structure, response), families(structure, response, between=True))
         more = fit.fit(stamped, response, starts=[whole.theta, *(np.append(theta, np.zeros(len(sticks))) for theta in starts)])
         whole = more if more.ml < whole.ml else whole
@@ -108,8 +125,11 @@ def doubts(found: Fit) -> list[str]:
     return notes
 
 
-def resampled(flight: Flight) -> Swept:
-    """Sticks and answers on one clock, and its records. Raises LogError with the message that is missing."""
+def resampled(flight: Flight, late_s: float = 0.0) -> Swept:
+    """Sticks and answers on one clock, and its records; answers are read `late_s` after the sticks' stamps.
+
+    Raises LogError with the message that is missing.
+    """
     s = flight.sticks
     if s is None:
         raise LogError("no SET_ACTUATOR_CONTROL_TARGET of group 3: record what the companion sends (mavquad fly sweep)")
@@ -132,10 +152,11 @@ def resampled(flight: Flight) -> Swept:
         np.column_stack([timebase.held_mean(Held(at, values[:, i]), edges) for i in range(4)])
         for at, values in ((s.added_t_s, s.added), (s.applied_t_s, s.applied))
     ]
-    euler = np.column_stack([np.interp(t, turn.t_s, turn.euler_rad[:, i]) for i in range(3)])
+    then = t + late_s
+    euler = np.column_stack([np.interp(then, turn.t_s, turn.euler_rad[:, i]) for i in range(3)])
     at, rates = (turn.t_s, turn.rate_rad_s) if imu is None else (imu.t_s, imu.second)
-    omega = np.column_stack([np.interp(t, at, rates[:, i]) for i in range(3)])
-    v_ned = np.column_stack([np.interp(t, position.t_s, position.second[:, i]) for i in range(3)])
+    omega = np.column_stack([np.interp(then, at, rates[:, i]) for i in range(3)])
+    v_ned = np.column_stack([np.interp(then, position.t_s, position.second[:, i]) for i in range(3)])
     y = np.column_stack([in_body(euler, v_ned), omega, euler[:, :2]])
     gaps = [gap for at in streams.values() for gap in timebase.rhythm(at).gaps]
     sweeps, checks = _spans(t, held[0], gaps)

@@ -182,7 +182,7 @@ def torque(t_s: np.ndarray, gyro_rad_s: np.ndarray, t_motor_s: np.ndarray, motor
             share = pattern / np.abs(pattern).max()
             share[np.abs(share) < 0.25] = 0.0
             u = each @ share / np.sum(share**2)
-            r = float(np.corrcoef(u, turn)[0, 1]) if np.std(u) > 0.0 else 0.0
+            r = float(np.corrcoef(u, turn)[0, 1]) if min(np.std(u), np.std(turn)) > 0.0 else 0.0
             if best is None or r * r > best[0]:
                 best = (r * r, float(lag), share * np.sign(r), u * np.sign(r))
     if best is None or best[0] < 0.5:

@@ -22,20 +22,27 @@ def quaternion(roll, pitch):
     return (float(cr * cp), float(sr * cp), float(cr * sp), float(-sr * sp))
 
 
-def write_log(path, *, attitude_hz=50.0, sent=True, amplitude=0.12, restart=False):
-    """Roll swept for 70 s, then both axes for 30 s; commands leave 2 ms before they arrive, telemetry jitters by 4 ms."""
+def write_log(path, *, attitude_hz=50.0, sent=True, amplitude=0.12, restart=False, gaps=(), jitter_s=0.0, turned=1.0, more=()):
+    """Roll swept for 70 s, then both axes for 30 s; commands leave 2 ms before they arrive, telemetry jitters by 4 ms.
+
+    `gaps` in the attitude (from, to), `jitter_s` of its stamps, its sign `turned`, `more` messages as (name, rate_hz, fields of t).
+    """
     rng = np.random.default_rng(2)
     t_sent = np.cumsum(rng.uniform(0.015, 0.025, 5250))
     plan = Sweep(amplitude=amplitude, f_start_hz=0.1, f_end_hz=5.0, duration_s=65.0, quiet_s=2.0)
     later = (t_sent > 72.0) & (t_sent < 103.0)
     roll = np.array([value(plan, x) for x in t_sent]) + amplitude * later * np.sin(1.7 * t_sent)
     pitch = amplitude * later * np.sin(2.3 * t_sent + 1.0)
-    t_att = np.arange(0.5, 104.0, 1.0 / attitude_hz)
-    answer = [attitude.predict(TRUTH, Held(t_sent, u), t_att) for u in (roll, pitch)]
+    t_even = np.arange(0.5, 104.0, 1.0 / attitude_hz)
+    t_att = t_even + jitter_s * rng.uniform(-1.0, 1.0, t_even.size)
+    answer = [turned * np.interp(t_att, t_even, attitude.predict(TRUTH, Held(t_sent, u), t_even)) for u in (roll, pitch)]
+    speed = [np.gradient(a, t_att) for a in answer]
     entries = []
     for k, t in enumerate(t_att):
+        if any(a < t < b for a, b in gaps):
+            continue
         boot = int(1000 * t) + (60_000 if not restart or t < 90.0 else -85_000)
-        fields = (boot, float(answer[0][k]), float(answer[1][k]), 0.3, 0.0, 0.0, 0.0)
+        fields = (boot, *(float(x[k]) for x in answer), 0.3, *(float(x[k]) for x in speed), 0.0)
         entries.append(
             (t + 0.002 + rng.exponential(0.004), wire.encode("ATTITUDE", fields, seq=k % 256, system=1, component=1))
         )
@@ -43,6 +50,17 @@ def write_log(path, *, attitude_hz=50.0, sent=True, amplitude=0.12, restart=Fals
         for k, t in enumerate(t_sent):
             fields = (int(1000 * t), 1, 1, 7, quaternion(roll[k], pitch[k]), 0.0, 0.0, 0.0, 0.4)
             entries.append((t, wire.encode("SET_ATTITUDE_TARGET", fields, seq=k % 256, system=255, component=190)))
+    for name, rate_hz, fields in more:
+        for k, t in enumerate(np.arange(0.5, 104.0, 1.0 / rate_hz)):
+            values = fields(
+                t,
+                {
+                    "roll": np.interp(t, t_att, answer[0]),
+                    "rollspeed": np.interp(t, t_att, speed[0]),
+                    "sent": np.interp(t, t_sent, roll),
+                },
+            )
+            entries.append((t + 0.003, wire.encode(name, values, seq=k % 256, system=1, component=1)))
     entries.sort(key=lambda entry: entry[0])
     path.write_bytes(b"".join((START_US + int(1e6 * t)).to_bytes(8, "big") + raw for t, raw in entries))
     return path
@@ -93,6 +111,84 @@ def test_what_a_log_lacks_is_said_with_what_to_record(change, message, tmp_path,
     path = write_log(tmp_path / "poor.tlog", **change)
     assert program.main(["identify", str(path)]) == 1
     assert message in capsys.readouterr().err
+
+
+def imu(x_sign=1.0, z_m_s2=-9.81):
+    """HIGHRES_IMU: a hover that rolls."""
+    return (
+        "HIGHRES_IMU",
+        50.0,
+        lambda t, now: (int(1e6 * t) + 60_000_000, 0.0, 0.0, z_m_s2, x_sign * float(now["rollspeed"]), *(0.0,) * 9, 63, 0),
+    )
+
+
+def target(limit_rad=9.9):
+    """ATTITUDE_TARGET: the command as far as the autopilot goes, at 0.4 of full thrust."""
+    return (
+        "ATTITUDE_TARGET",
+        50.0,
+        lambda t, now: (
+            int(1000 * t) + 60_000,
+            0,
+            quaternion(float(np.clip(now["sent"], -limit_rad, limit_rad)), 0.0),
+            0.0,
+            0.0,
+            0.0,
+            0.4,
+        ),
+    )
+
+
+def position(v_sign=1.0):
+    """LOCAL_POSITION_NED: 3 m/s there and back."""
+    return (
+        "LOCAL_POSITION_NED",
+        50.0,
+        lambda t, now: (int(1000 * t) + 60_000, 6.0 * np.sin(0.5 * t), 0.0, -5.0, v_sign * 3.0 * np.cos(0.5 * t), 0.0, 0.0),
+    )
+
+
+def servos(top_us=2000):
+    """SERVO_OUTPUT_RAW: four motors that turn the roll, two each way, cut at `top_us`."""
+
+    def fields(t, now):
+        left, right = (int(np.clip(1600 + sign * 4000 * now["sent"], 1150, top_us)) for sign in (-1, 1))
+        return (int(1e6 * t) % 2**32 + 60_000_000, 0, right, left, left, right, *(0,) * 12)
+
+    return "SERVO_OUTPUT_RAW", 50.0, fields
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"gaps": [(30.0, 33.0), (80.0, 80.5)]}, "ATTITUDE: 1 gaps, the longest 3.0"),
+        (
+            {"gaps": [(x, x + 1.0) for x in range(5, 100, 15)]},
+            "roll from SET_ATTITUDE_TARGET: no stretch of 20 s without a gap",
+        ),
+        ({"jitter_s": 0.006}, "ATTITUDE: stamps spread by"),
+        (
+            {"turned": -1.0},
+            "roll from SET_ATTITUDE_TARGET: the attitude moves against the command: the two have different sign",
+        ),
+        (
+            {"more": [imu(x_sign=-1.0), servos()]},
+            "torque per command, roll: HIGHRES_IMU.xgyro runs against the change of ATTITUDE.roll",
+        ),
+        ({"more": [imu(z_m_s2=9.81), target()]}, "hover thrust: HIGHRES_IMU.zacc shows +9.8 m/s^2 in flight, FRD shows -9.8"),
+        ({"more": [imu(), position(v_sign=-1.0)]}, "drag: LOCAL_POSITION_NED.vx runs against the change of x"),
+        ({"more": [servos(top_us=1900)]}, "SERVO_OUTPUT_RAW: a motor stands at its limit (1900 us) for"),
+        ({"more": [target(limit_rad=0.06)]}, "roll: the autopilot stops at 3 deg (ATTITUDE_TARGET) where 7 deg were asked"),
+        ({}, "hover thrust: no thrust (ATTITUDE_TARGET) beside an accelerometer (HIGHRES_IMU) in flight; record both"),
+        ({}, "drag: no velocity (LOCAL_POSITION_NED) beside an accelerometer (HIGHRES_IMU) in flight; record both"),
+        ({}, "torque per command, roll: no SERVO_OUTPUT_RAW with moving motors in this log; ask for it at 50 Hz"),
+        ({}, "yaw from SET_ATTITUDE_TARGET: its command moves for 0 s only (needs 20); record a sweep on it"),
+    ],
+)
+def test_what_is_wrong_with_a_log_is_said_in_one_line(change, line, tmp_path, capsys):
+    assert program.main(["identify", str(write_log(tmp_path / "poor.tlog", **change))]) in (0, 1)
+    shown = capsys.readouterr().out.splitlines()
+    assert [text for text in shown if line in text], "\n".join(shown)
 
 
 def test_a_log_without_attitude_and_a_missing_file_are_refused(tmp_path, capsys):

@@ -7,7 +7,7 @@ import pytest
 
 from mavquad import airframe, sweep_flight, wire
 from mavquad.errors import ConfigError, LogError
-from mavquad.identify import timebase
+from mavquad.identify import fit, models, timebase
 from mavquad.signals import NAN3, ZERO3, Demand, Estimate
 from mavquad.sweep_flight import LEAD_S, Params
 from tools import identify_hover, identify_log
@@ -119,6 +119,39 @@ def test_a_part_whose_stick_was_not_swept_says_which_axis_to_fly():
     swept = identify_hover.resampled(log())
     with pytest.raises(LogError, match="stick ped and col never swept; add --axis yaw --axis thrust"):
         identify_hover.part(swept, "yaw and heave", *identify_hover.PARTS["yaw and heave"])
+
+
+def yaw_and_heave(late_s):
+    """The exact answer of REF's yaw and heave at 500 Hz to sticks held for 20 ms, which are stamped `late_s` after they acted."""
+    gains = sweep_flight.gains(
+        Params(axes=("yaw", "thrust"), stick_sweep_s=40.0, stick_records=1, stick_quiet_s=3.0, check_s=0.0), HELI
+    )
+    plant, h = models.ref_yaw_heave(), 0.002
+    ad, bd = fit.discretized(plant.a, plant.b, h)
+    added = np.repeat([sweep_flight.excitation_at(gains, 0.02 * k) for k in range(5000)], 10, axis=0)
+    x, answer = np.zeros(3), np.empty((len(added), 2))
+    for k, u in enumerate(added[:, 2:]):
+        answer[k] = x[:2]
+        x = ad @ x + bd @ u
+    t, zeros = h * np.arange(len(added)), np.zeros((len(added), 3))
+    w, r = (np.column_stack([zeros[:, :2], column]) for column in answer.T)
+    sticks = identify_log.Sticks(t + late_s, added, t + late_s, added)
+    return identify_log.Flight(
+        None, len(t), t[-1], identify_log.Turn(t, zeros, r, "ATTITUDE"), None, None, identify_log.Vectors(t, zeros, r, "HIGHRES_IMU"),
+        identify_log.Vectors(t, zeros, w, "LOCAL_POSITION_NED"), None, ((0.0, t[-1]),), timebase.SAME, np.zeros(0), (), sticks,
+    )  # fmt: skip
+
+
+def test_the_answer_is_taken_where_the_sticks_change_although_they_are_stamped_late():
+    flight = yaw_and_heave(late_s=0.0046)
+    name, truth = "yaw and heave", models.REF_YAW_HEAVE
+    early = identify_hover.part(identify_hover.resampled(flight), name, *identify_hover.PARTS[name])
+    (found,), missing = identify_hover.identify(flight)
+    assert [words.partition(":")[0] for words in missing] == ["longitudinal", "lateral"]
+    assert found.late_s == pytest.approx(-0.0046, abs=5e-4)
+    for parameter in ("Z_w", "N_r", "N_ped", "K_r", "K_rfb", "Z_col", "N_col"):
+        assert found.found.parameters[parameter] == pytest.approx(truth[parameter], rel=0.02), parameter
+    assert abs(early.found.parameters["N_r"] / truth["N_r"] - 1.0) > 0.04  # a mere delay does not mend it
 
 
 def test_velocities_are_taken_along_the_body():
