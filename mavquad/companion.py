@@ -392,6 +392,7 @@ class Companion:
             "interventions": self.flight.interventions,
             "hover_thrust": self.flight.hover_thrust,
             "delay_s": self.flight.delay_s,
+            "position_age_s": self.flight.position_age.age_s,
             "controller": diagnose(self.flight.controller) if diagnose else {},
             "rates_hz": {r.name: r.granted_hz for r in life.rates},
             "observer_samples": {

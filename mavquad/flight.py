@@ -4,12 +4,12 @@ import difflib
 import math
 from typing import Any
 
-from mavquad import following, lifecycle, wire
+from mavquad import following, lifecycle, position_age, wire
 from mavquad.errors import ConfigError
 from mavquad.lifecycle import Life
 from mavquad.plan import Plan
 from mavquad.setpoint.attitude import G_M_S2
-from mavquad.signals import ZERO3, Estimate, Position, Setpoint, Sticks, Target, Vec3
+from mavquad.signals import ZERO3, Estimate, Position, Quat, Setpoint, Sticks, Target, Vec3
 
 
 class Flight:
@@ -39,7 +39,9 @@ class Flight:
     tick_us: int
     timesync_us: int
     publish_us: int
+    q_wxyz: Quat  # newest attitude
     position: Position | None
+    position_age: position_age.State  # how far behind its stamp it is
     offset_m: Vec3  # subtracted from every position: the sum of the autopilot's own resets
     origin_m: Vec3  # where the vehicle was armed
     estimate: Estimate | None
@@ -119,6 +121,7 @@ def forget(plan: Plan, f: Flight) -> None:
     f.control_gap_us = 0
     f.stamps, f.arrivals, f.behind = {}, {}, 0
     f.newest_arrival_us = f.pace_us = 0
+    f.q_wxyz, f.position_age = (1.0, 0.0, 0.0, 0.0), position_age.START
     f.position, f.offset_m, f.origin_m, f.estimate = None, ZERO3, ZERO3, None
     f.anchor_p_m, f.anchor_yaw_rad = ZERO3, 0.0
     f.delay_echo_s, f.setpoints = math.nan, ()

@@ -55,7 +55,8 @@ class Plan(NamedTuple):
     compensator: Stage | None
     observers: tuple[Stage, ...]
     control_us: int
-    samples: dict[int, str]  # messages whose samples some stage uses, by id
+    samples: dict[int, str]  # messages whose samples are used, by id
+    imu_spared: bool  # no stage takes accelerometers: some are enough to tell how old positions are
     trace_names: tuple[str, ...]
     warnings: tuple[str, ...]  # of the checks at design time: what will fly, but not well
     slowed: tuple[Any, ...]  # the controller's gains for a late companion, by how late it is
@@ -123,6 +124,7 @@ def build(settings: Companion, airframe: Airframe | None = None) -> Plan:
     controller_stage = stage(
         "controller", settings.controller, {settings.controller: module}, _with_loop(settings, module), airframe
     )
+    samples = _samples((estimator_stage, controller_stage, compensator, *observers))
     return Plan(
         settings,
         airframe,
@@ -133,7 +135,8 @@ def build(settings: Companion, airframe: Airframe | None = None) -> Plan:
         compensator,
         observers,
         round(1e6 / control_hz),
-        _samples((estimator_stage, controller_stage, compensator, *observers)),
+        {wire.ID["HIGHRES_IMU"]: "HIGHRES_IMU", **samples},
+        wire.ID["HIGHRES_IMU"] not in samples,
         publish.trace_names(tuple(s.label for s in observers), compensator.module if compensator else None),
         tuple(adrc_checks.enforce(_checks(estimator_stage, controller_stage))),
         slowing.designs(controller_stage.module, controller_stage.params, airframe),

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from mavquad import control_step, lifecycle, outbox, slowing, wire
+from mavquad import control_step, lifecycle, outbox, position_age, slowing, wire
 from mavquad.errors import LinkError
 from mavquad.flight import Flight, forget
 from mavquad.lifecycle import ENGAGED, OBSERVING, STREAMING
@@ -17,6 +17,7 @@ _LATE_US = 2_000_000  # a stamp further back than this is a restarted clock, not
 _OLD_US = 60_000  # a sample this late, right behind another, comes out of a queue
 _USUAL_S = 2.0  # memory of the mean age, that of the round trip
 _WITH_ATTITUDE = ("ATTITUDE_QUATERNION", "ATTITUDE")
+_SPARED_US = 12_000  # between accelerometer samples that only the age of positions needs
 _DOUBLED_US = 500_000  # ATTITUDE is left out while the quaternion was heard so recently
 
 
@@ -24,6 +25,8 @@ def take(plan: Plan, f: Flight, name: str, frame: Frame) -> None:
     """One message of the autopilot that some stage uses."""
     if name == "ATTITUDE" and f.arrival_us - f.arrivals.get("ATTITUDE_QUATERNION", -_DOUBLED_US) < _DOUBLED_US:
         return  # the quaternion says the same, more often and without angles
+    if name == "HIGHRES_IMU" and plan.imu_spared and f.arrival_us - f.arrivals.get(name, -_SPARED_US) < _SPARED_US:
+        return
     try:
         sample: Any = decode.DECODERS[name](wire.decode(frame))
     except LinkError:
@@ -47,7 +50,13 @@ def take(plan: Plan, f: Flight, name: str, frame: Frame) -> None:
         f.now_us, f.newest_arrival_us = t_us, f.arrival_us
     kind = type(sample)
     if kind is Position:
-        sample = _continuous(plan, f, sample)
+        f.position_age = position_age.hear(f.position_age, t_us, sample.v_ned_m_s)
+        p, v = position_age.carried(f.position_age, sample.p_ned_m, sample.v_ned_m_s)
+        sample = _continuous(plan, f, sample._replace(p_ned_m=p, v_ned_m_s=v))
+    elif kind is Imu:
+        f.position_age = position_age.feel(f.position_age, t_us, sample.accel_m_s2, f.q_wxyz)
+        if plan.imu_spared:
+            return
     elif kind is Target:
         f.echo = sample
         _learn_hover(f, sample)
@@ -62,6 +71,7 @@ def take(plan: Plan, f: Flight, name: str, frame: Frame) -> None:
     if plan.compensator is not None:
         f.compensator = plan.compensator.module.observe(plan.compensator.gains, f.compensator, sample)
     if kind is Attitude:
+        f.q_wxyz = sample.q_wxyz
         _pace(f)
         _punctual(plan, f, t_us)
         gap_us = t_us - f.control_us

@@ -61,6 +61,7 @@ def summarise(run: Path, name: str, resolved: Resolved, flown: Flown, command: s
         "refused": {"companion": said.get("refused") or {}, "sitl": sitl.get("frames_refused") or {}},
         "granted_hz": said.get("rates_hz"),
         "delay_s": said.get("delay_s"),
+        "position_age_s": said.get("position_age_s"),
         "pacing_ms": sitl.get("pacing_ms"),
         "solver": said.get("controller") or {},
         "counts": said.get("counts") or {},
