@@ -9,6 +9,7 @@ a hash of its source and of all that it imports from this project, however indir
 
 import functools
 import hashlib
+import importlib.metadata
 import os
 import re
 import sys
@@ -16,8 +17,6 @@ import tempfile
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, TypeVar, cast
-
-import numba
 
 COMPILED = os.environ.get("NUMBA_DISABLE_JIT", "0") in ("", "0")
 
@@ -58,7 +57,7 @@ def source_hash(modules: Iterable[str]) -> str:
         if module not in seen:
             seen.add(module)
             todo.extend(_imports(module))
-    digest = hashlib.sha256(numba.__version__.encode())
+    digest = hashlib.sha256(importlib.metadata.version("numba").encode())
     for module in sorted(seen):
         digest.update(module.encode())
         digest.update(_source(module))
@@ -96,5 +95,7 @@ def kernel(function: _F) -> _F:
     """Compile a scalar function: cached, numpy's error model (x/0 is inf, never an exception), no fastmath."""
     if not COMPILED:
         return function
+    import numba  # half a second: only where a kernel is
+
     numba.config.CACHE_DIR = _folder(function.__module__)  # type: ignore[attr-defined]  # read by njit where it decorates
     return cast(_F, numba.njit(cache=True, error_model="numpy")(function))

@@ -1,5 +1,6 @@
 """One flight as two processes over UDP: start them, watch them, end them, and read what they left in the run folder."""
 
+import contextlib
 import json
 import os
 import signal
@@ -19,6 +20,7 @@ from tools.scenarios import Resolved
 
 _POLL_S = 0.1
 _GRACE_S = 10.0  # for a program to end cleanly before it is killed
+_ERROR = "mavquad: "  # begins the companion's own last words
 _LANDED_S = 2.0  # vehicle time on the ground before the simulated autopilot ends
 
 Watcher = Callable[[float, list[str]], None]  # vehicle time of the companion [s, NaN before], new lines it said
@@ -50,7 +52,7 @@ def prepare(run: Path, resolved: Resolved) -> None:
     """The run folder with both configurations. Raises FlightError where it holds a flight already."""
     try:
         run.mkdir(parents=True, exist_ok=True)
-        if (run / "flight.tlog").exists() or (run / "sitl.tlog").exists():
+        if any(log.exists() and log.stat().st_size for log in (run / "flight.tlog", run / "sitl.tlog")):
             raise FlightError(f"{run}: holds a flight already, which is never overwritten; choose another --run")
         (run / "sitl.toml").write_text(toml.dumps(msgspec.to_builtins(resolved.sitl)), encoding="utf-8")
         (run / "companion.toml").write_text(toml.dumps(msgspec.to_builtins(resolved.companion)), encoding="utf-8")
@@ -88,11 +90,26 @@ def fly(run: Path, pace: Pace, max_time_s: float, watch: Watcher, forward: str =
         _end(companion)
         _end(sitl)
         watch(vehicle_time_s(run / "flight.trace"), said.new())
+    refusal = _last_words(run / "companion.txt")
+    if refusal.startswith(_ERROR) and not (run / "flight.tlog").exists():  # nothing flew
+        _forget(run)
+        raise FlightError(refusal.removeprefix(_ERROR))
     if sitl.returncode:
         problems.append(f"the simulated autopilot ended with {sitl.returncode}: {_last_words(run / 'sitl.txt')}")
     elif companion.returncode and not problems:
         problems.append(f"the companion ended with {companion.returncode}: {_last_words(run / 'companion.txt')}")
     return Flown(_last_json(run / "sitl.json"), _last_json(run / "companion.json"), wall_s, said.all, problems)
+
+
+def _forget(run: Path) -> None:
+    """Take away what was laid out for a flight that never began; the folder stays where anything else is in it."""
+    for name in ("sitl", "companion"):
+        for kind in ("toml", "json", "txt", "tlog"):
+            file = run / f"{name}.{kind}"
+            if file.exists() and (kind != "tlog" or not file.stat().st_size):
+                file.unlink()
+    with contextlib.suppress(OSError):
+        run.rmdir()
 
 
 def _given_up(said: list[str]) -> bool:
@@ -153,7 +170,7 @@ class _Tail:
         lines = data[self._at : whole].decode("utf-8", "replace").splitlines()
         self._at = max(self._at, whole)
         self.all += lines
-        return lines
+        return [line for line in lines if not line.startswith(_ERROR)]  # that one is the error of the flight
 
 
 def _last_words(path: Path) -> str:

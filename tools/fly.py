@@ -17,6 +17,7 @@ import shlex
 import signal
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -84,18 +85,23 @@ def run(args: argparse.Namespace) -> int:
 
 def one(args: argparse.Namespace, folder: Path, forward: str = "") -> dict[str, Any]:
     """Fly, score and draw into an empty folder; its summary. `forward`: who hears every datagram. Raises ConfigError, FlightError."""
-    from mavquad import plan
-    from tools import flight, summary, warm
+    from tools import flight, warm
+
+    def path_s() -> float:
+        from tools import summary  # what takes long to load comes when both programs run
+
+        return summary.path_duration_s(resolved.companion)
 
     resolved = resolve(args)
-    plan.build(resolved.companion)  # what is wrong with it is known before anything starts
     flight.prepare(folder, resolved)
     max_time_s = resolved.scenario.flight.max_time_s
     signal.signal(signal.SIGTERM, _terminated)
-    with Progress(summary.path_duration_s(resolved.companion), quiet=args.json) as progress:
+    with Progress(path_s, quiet=args.json) as progress:
         warm.ensure(f"flight {stages(resolved.companion)}", lambda: warm.flight(resolved), progress.say)
         flown = flight.fly(folder, flight.Pace(args.speed), max_time_s, progress.watch, forward)
         progress.say("scoring")
+        from tools import summary
+
         result = summary.summarise(folder, Path(args.scenario).stem, resolved, flown, command(args), args.speed is None)
         if not args.no_report and not flown.problems:
             from tools import report
@@ -179,7 +185,7 @@ def _terminated(*_: Any) -> None:
 class Progress:
     """Progress in vehicle time on stderr: a bar on a terminal, else a line for each change of state."""
 
-    def __init__(self, path_s: float, quiet: bool = False) -> None:
+    def __init__(self, path_s: Callable[[], float], quiet: bool = False) -> None:
         self._path_s = path_s
         self._engaged_s = math.nan
         self._live: Any = None
@@ -194,7 +200,7 @@ class Progress:
 
             columns = (TextColumn("{task.fields[t]:>8}"), BarColumn(), TextColumn("{task.description}"))
             self._live = Progress(*columns, console=Console(stderr=True), transient=True)
-            self._task = self._live.add_task("starting", total=self._path_s, t="")
+            self._task = self._live.add_task("starting", total=None, t="")
             self._live.start()
         return self
 
@@ -207,9 +213,11 @@ class Progress:
         for line in said:
             if "engaged:" in line and math.isnan(self._engaged_s):
                 self._engaged_s = t_s
+                if self._live is not None:
+                    self._live.update(self._task, total=self._path_s())
             self.say(line.strip())
         if self._live is not None and not math.isnan(t_s):
-            done = 0.0 if math.isnan(self._engaged_s) else min(self._path_s, max(0.0, t_s - self._engaged_s))
+            done = 0.0 if math.isnan(self._engaged_s) else max(0.0, t_s - self._engaged_s)
             self._live.update(self._task, completed=done, t=f"{t_s:.1f} s")
 
     def say(self, words: str) -> None:

@@ -13,8 +13,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mavquad.errors import FlightError, LogError
 
 BEST = "eskf-mpc"
@@ -34,12 +32,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Two flights and their page. 0 where both went well, 1 where not."""
-    from mavquad import plan
     from tools import fly, summary
 
     sides = {"left": _options(args, args.left), "right": _options(args, args.right)}
-    for options in sides.values():  # what is wrong with either is known before anything flies
-        plan.build(fly.resolve(options).companion)
+    if args.right != BEST:  # what is wrong with it is known before the other flies
+        from mavquad import plan
+
+        plan.build(fly.resolve(sides["right"]).companion)
     name = Path(args.scenario).stem
     folder = args.run or Path("runs") / f"{time.strftime('%Y%m%d-%H%M%S')}-{name}-{args.seed}-versus"
     results = [fly.one(options, folder / side) for side, options in sides.items()]
@@ -86,6 +85,8 @@ def verdict(results: list[dict[str, Any]], args: argparse.Namespace) -> str:
 
 def draw(folder: Path, args: argparse.Namespace) -> Path:
     """`versus.html` in the folder that holds `left` and `right`. Raises LogError where a flight left no trace."""
+    import numpy as np
+
     from mavquad.link.columns import Log
     from tools import page as html
     from tools import score

@@ -164,11 +164,11 @@ def test_an_unwritable_place_is_said(tmp_path):
 
 
 def test_progress_on_a_pipe_is_a_line_per_change(capsys):
-    with fly.Progress(10.0) as progress:
+    with fly.Progress(lambda: 10.0) as progress:
         progress.watch(float("nan"), [])
         progress.watch(1.0, ["    0.100 s  configuring: PX4 1/1"])
         progress.watch(12.0, ["   10.096 s  engaged: setpoints are flown"])
     assert capsys.readouterr().err.splitlines() == ["0.100 s  configuring: PX4 1/1", "10.096 s  engaged: setpoints are flown"]
-    with fly.Progress(10.0, quiet=True) as progress:
+    with fly.Progress(lambda: 10.0, quiet=True) as progress:
         progress.watch(1.0, ["x"])
     assert capsys.readouterr().err == ""
