@@ -37,7 +37,7 @@ def step(plan: Plan, f: Flight, t_us: int, dt_s: float) -> None:
     sent = f.sent or Setpoint((1.0, 0.0, 0.0, 0.0), ZERO3, f.hover_thrust, 7)
     q_sent = sent.q_wxyz
     rates = sent.omega_rad_s if sent.type_mask != 7 else NAN3
-    applied = Applied(t_us, q_sent, f.applied_thrust_m_s2, rates, f.delay_s, f.age_s)
+    applied = Applied(t_us, q_sent, f.applied_thrust_m_s2, rates, f.delay_s, f.age_s, sent.thrust if f.sent else math.nan)
     f.estimator, estimate = plan.estimator.module.step(plan.estimator.gains, f.estimator, applied, t_us)
     f.estimate = estimate
     flying = f.life.state in (STREAMING, ENGAGED) and f.anchor > 0

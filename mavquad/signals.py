@@ -80,6 +80,7 @@ class Applied(NamedTuple):
     omega_rad_s: Vec3  # rates last sent (NaN where none)
     delay_s: float  # measured command delay, companion to autopilot and back into telemetry
     age_s: float = 0.0  # of the newest sample when it arrived, less its mean, which is in delay_s
+    collective: float = math.nan  # what was sent for thrust_m_s2, 0..1: the autopilot's echo of it is recognised
 
 
 class Estimate(NamedTuple):

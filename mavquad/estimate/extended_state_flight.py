@@ -5,7 +5,8 @@ the attitude that it reports, and the airframe's own drag at the estimated veloc
 is vehicle time: a sample acts at its stamp, however late it arrives.
 
 Deviations from the paper (beside those of `extended_state_kf.py`):
-  input     the echoed thrust, not the commanded one: 100 ms of unmodelled delay makes the vertical estimate oscillate.
+  input     the thrust that acts by its echo, not the commanded one: 100 ms of unmodelled delay makes the vertical estimate
+            oscillate. An echo of a setpoint of ours puts the line of those sent in time, which tells what acts between echoes.
   drag      modelled from the airframe file, so that f changes with the wind and not with the path.
   offset    telemetry's velocity is not the derivative of its position (0.02 m/s is common), which holds any filter that trusts
             both some centimetres off: the slow part of the position is anchored to the raw one.
@@ -29,6 +30,7 @@ _NO_RATE = 1e9  # variance of a velocity that did not come
 _LATE_S = 0.25  # a position older than the filter by more is not used
 _COAST_S = 0.5  # the longest step without samples that is integrated
 _ECHO_S = 0.3  # an echo older than this is not the present thrust
+_SAME = 1e-6  # collectives this near are one: a float's rounding
 _SCALE_S = 1.0  # memory of the scale between echoed and specific thrust
 
 
@@ -43,7 +45,7 @@ class Params:
     adapt: float = 0.0  # weight of a new residual in R (0: R stays)
     anchor_s: float = 1.5  # time constant of the raw position's slow part (0: off)
     drag: float = 1.0  # share of the airframe file's drag taken as known
-    echo: bool = True  # thrust as echoed in ATTITUDE_TARGET; else as sent, delayed by the measured round trip
+    echo: bool = True  # ATTITUDE_TARGET says which thrust acts; else it is what was sent, delayed by the measured round trip
     thrust_lag_s: float = -1.0  # of the rotors; < 0: from the airframe
 
     def __post_init__(self) -> None:
@@ -70,6 +72,14 @@ class Gains(NamedTuple):
     echo: bool
 
 
+class Sent(NamedTuple):
+    """One setpoint: the vehicle time at which it acts, its specific thrust, and the collective that carries it."""
+
+    acts_us: int
+    thrust_m_s2: float
+    collective: float
+
+
 class State(NamedTuple):
     """What is known, at vehicle time t_us of the filter; axes None before the first position."""
 
@@ -81,7 +91,9 @@ class State(NamedTuple):
     echoed: float  # newest collective of ATTITUDE_TARGET
     echo_us: int
     scale: float  # specific thrust per echoed collective
-    sent: tuple[tuple[int, float], ...]  # (vehicle time, specific thrust) of the last setpoints
+    sent: tuple[Sent, ...]  # the last setpoints, oldest first
+    known_us: int  # newest echo that was one of them; 0: none yet
+    acts_us: int  # when the setpoint of the last control step reaches the vehicle
     delay_s: float
     offset_m: Vec3  # slow part of raw minus filtered position
     position_us: int
@@ -109,7 +121,7 @@ def gains(params: Params, airframe: Airframe) -> Gains:
 
 
 def init(gains: Gains) -> State:
-    return State(0, None, quat.IDENTITY, ZERO3, G_M_S2, math.nan, 0, math.nan, (), 0.0, ZERO3, 0)
+    return State(0, None, quat.IDENTITY, ZERO3, G_M_S2, math.nan, 0, math.nan, (), 0, 0, 0.0, ZERO3, 0)
 
 
 @kernel
@@ -179,7 +191,7 @@ def observe(gains: Gains, state: State, sample: object) -> State:
     if isinstance(sample, Position):
         return _position(gains, state, sample)
     if isinstance(sample, Target):
-        return _target(state, sample)
+        return _target(gains, state, sample)
     return state
 
 
@@ -200,18 +212,19 @@ def _to(gains: Gains, state: State, t_us: int) -> State:
 
 
 def _thrust(gains: Gains, state: State, t_us: int) -> float:
-    """Specific thrust commanded at t: the echo where there is a fresh one, else what was sent one delay ago."""
-    if gains.echo and state.echo_us and t_us - state.echo_us <= 1e6 * _ECHO_S and math.isfinite(state.scale):
+    """Specific thrust commanded at t: what was sent, as long as its echo comes back; another's as echoed; else what was sent."""
+    heard = gains.echo and state.echo_us and t_us - state.echo_us <= 1e6 * _ECHO_S and math.isfinite(state.scale)
+    if heard and t_us - state.known_us > 1e6 * _ECHO_S:
         return state.scale * state.echoed
-    return _sent_at(state, t_us - round(1e6 * state.delay_s))
+    return _sent_at(state, t_us)
 
 
 def _sent_at(state: State, t_us: int) -> float:
     found = G_M_S2
-    for sent_us, thrust in state.sent:
-        if sent_us > t_us:
+    for sent in state.sent:
+        if sent.acts_us > t_us:
             break
-        found = thrust
+        found = sent.thrust_m_s2
     return found
 
 
@@ -257,12 +270,14 @@ def _hears(g: KfGains, axis: KfState) -> KfState:
     return axis._replace(r=(g.r_first, g.r_second))
 
 
-def _target(state: State, sample: Target) -> State:
-    """The echo's thrust, and its scale: what was sent a delay ago over what is echoed, slowly averaged."""
+def _target(gains: Gains, state: State, sample: Target) -> State:
+    """The echo's thrust, what it says of our own line, and its scale: what acts by our own line over what is echoed, slowly averaged."""
     u = sample.thrust
     if not (math.isfinite(u) and 0.02 < u <= 1.0):
         return state
-    ratio = _sent_at(state, sample.t_us - round(1e6 * state.delay_s)) / u
+    if gains.echo:
+        state = _recognised(state, u, sample.t_us)
+    ratio = _sent_at(state, sample.t_us) / u
     scale = state.scale
     if not math.isfinite(scale) or not state.sent:
         scale = ratio
@@ -272,13 +287,30 @@ def _target(state: State, sample: Target) -> State:
     return state._replace(echoed=u, echo_us=sample.t_us, scale=scale)
 
 
+def _recognised(state: State, u: float, t_us: int) -> State:
+    """An echo of a setpoint of ours says which one acts at t: those before it are over, those behind it had not arrived."""
+    found, apart_us = -1, round(1e6 * _ECHO_S)
+    for i, sent in enumerate(state.sent):
+        if abs(sent.collective - u) < _SAME and abs(sent.acts_us - t_us) < apart_us:
+            found, apart_us = i, abs(sent.acts_us - t_us)
+    if found < 0:
+        return state
+    line = [
+        sent._replace(acts_us=min(sent.acts_us, t_us) if i <= found else max(sent.acts_us, t_us + 1))
+        for i, sent in enumerate(state.sent)
+    ]
+    return state._replace(sent=tuple(line), known_us=t_us)
+
+
 def step(gains: Gains, state: State, applied: Applied, t_us: int) -> tuple[State, Estimate]:
     """Once per control tick: remember what was sent, and say where the vehicle is at t."""
     thrust = applied.thrust_m_s2
     if math.isfinite(thrust) and thrust >= 0.0:  # a rotor does not pull: a negative thrust was never applied
-        state = state._replace(sent=(*state.sent[-63:], (t_us, thrust)))
+        state = state._replace(sent=(*state.sent[-63:], Sent(state.acts_us, thrust, applied.collective)))
     if math.isfinite(applied.delay_s):
         state = state._replace(delay_s=min(1.0, max(0.0, applied.delay_s)))
+    delay_s = max(0.0, state.delay_s + (applied.age_s if math.isfinite(applied.age_s) else 0.0))
+    state = state._replace(acts_us=max(state.acts_us, t_us + round(1e6 * delay_s)))
     state = _to(gains, state, t_us)
     if state.axes is None:
         return state, Estimate(t_us, NAN3, NAN3, state.q_wxyz, state.omega_rad_s, NAN3, NAN3)
@@ -294,7 +326,7 @@ def step(gains: Gains, state: State, applied: Applied, t_us: int) -> tuple[State
         state.omega_rad_s,
         (n.x[2] + air[0], e.x[2] + air[1], d.x[2] + air[2]),
         NAN3,
-        max(0.0, state.delay_s + (applied.age_s if math.isfinite(applied.age_s) else 0.0)),
+        delay_s,
         state.thrust_m_s2,
     )
 

@@ -71,11 +71,32 @@ def test_without_an_echo_the_thrust_sent_acts_one_delay_later():
     state = flight.init(GAINS)
     for ms in range(4, 404, 4):
         state = flight.observe(GAINS, state, Attitude(1000 * ms, quat.IDENTITY, ZERO3))
-        sent = G if ms <= 200 else 12.0
+        sent = G if ms <= 204 else 12.0  # "last sent": the one of the step before
         state, _ = flight.step(GAINS, state, Applied(1000 * ms, quat.IDENTITY, sent, NAN3, 0.1), 1000 * ms)
         if ms <= 300:
             assert state.thrust_m_s2 == pytest.approx(G, abs=1e-9)
     assert state.thrust_m_s2 == pytest.approx(12.0, abs=0.15)  # three rotor lags after the change arrived
+
+
+def test_an_echo_says_which_of_our_setpoints_acts():
+    """The delay is 60 ms where 20 were measured, and every fifth setpoint is lost: the echo puts the line right."""
+    state, sent, told = flight.init(GAINS), [], 0
+    for k in range(1, 200):
+        now = 8000 * k
+        state = flight.observe(GAINS, state, Attitude(now, quat.IDENTITY, ZERO3))
+        arrived = [u for i, (t, u) in enumerate(sent) if t + 60_000 <= now and i % 5]
+        if k % 3 == 0 and arrived:
+            state = flight.observe(GAINS, state, Target(now, quat.IDENTITY, NAN3, float(np.float32(arrived[-1])), 7))
+            acting = [s for s in state.sent if s.acts_us <= now][-1]
+            assert acting.collective == arrived[-1]
+            assert state.known_us == now
+            told += 1
+        last = sent[-1][1] if sent else 0.5
+        state, _ = flight.step(GAINS, state, Applied(now, quat.IDENTITY, G * last / 0.5, NAN3, 0.02, 0.0, last), now)
+        sent.append((now, 0.5 + 0.1 * math.sin(0.05 * k)))
+    assert told > 50
+    stamps = [s.acts_us for s in state.sent]
+    assert stamps == sorted(stamps)
 
 
 def test_an_estimate_from_an_older_sample_has_longer_to_wait_for_its_command():

@@ -59,7 +59,9 @@ def _flown(module, gains, samples, events):
             applied = Applied(sample.t_us, sample.q_wxyz, G * sample.thrust / HOVER, NAN3, 0.0)
             thrust = state.thrust if hasattr(state, "thrust") else None
             if thrust is None:
-                state = state._replace(sent=(*state.sent[-63:], (sample.t_us, applied.thrust_m_s2)))
+                state = state._replace(
+                    sent=(*state.sent[-63:], extended_state_flight.Sent(sample.t_us, applied.thrust_m_s2, sample.thrust))
+                )
             else:
                 state = state._replace(thrust=joint_flight.applied_thrust.remember(thrust, applied))
         else:
