@@ -5,7 +5,7 @@ CLIENTS := .venv-clients
 STAMP := .venv/.installed
 SCENARIO ?= gusty
 
-.PHONY: fly test test-page long soak mutate install test-clients fuzz lint clean mutate-limits
+.PHONY: fly test test-page long soak flood mutate install test-clients fuzz lint clean mutate-limits
 
 fly: install
 	@$(BIN)/mavquad versus $(SCENARIO)
@@ -37,6 +37,9 @@ mutate-limits: install  # each comparison, sign and constant of the last gate ch
 
 long: install  # eighty minutes of vehicle time in lockstep: flat memory, no miss
 	$(BIN)/python -m pytest -s tests/loop/test_long_flight.py -m slow
+
+flood: install  # ten seconds of junk at a companion in flight, as fast as one core sends it: it keeps its rate, its memory stays flat
+	$(BIN)/python -m pytest -s tests/loop/test_flood.py -m slow
 
 soak: install  # eighty minutes of vehicle time at ten times real time with faults and a listener between (MAVQUAD_SOAK_MINUTES)
 	$(BIN)/python -m pytest -s tests/loop/test_soak.py -m slow

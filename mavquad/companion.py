@@ -21,6 +21,7 @@ from mavquad.errors import FlightError
 from mavquad.lifecycle import Life
 from mavquad.link import clock, health
 from mavquad.link.endpoint import Address, Endpoint, UdpEndpoint
+from mavquad.link.flood import Guard
 from mavquad.link.signing import SETUP_SIGNING, Signer
 from mavquad.link.tlog import Writer
 from mavquad.pipeline import Flight, Plan
@@ -262,6 +263,7 @@ class Companion:
     def _run_live(self) -> None:
         started = last_heard = clock.monotonic_s()
         greet_us = 0
+        guard = Guard(self.endpoint.sock) if isinstance(self.endpoint, UdpEndpoint) else None
         while True:
             now_us = max(self._stamp_us, clock.wall_us())
             if not self.flight.heartbeat_us and now_us - greet_us > 1_000_000:  # nobody yet: say that we are here
@@ -270,9 +272,11 @@ class Companion:
             arrived = self.endpoint.receive(0.0 if self._stop else self._wait_s(now_us))
             begun = clock.monotonic_s()
             self._stamp_us = max(self._stamp_us, clock.wall_us())
+            if guard and guard.saw(sum(address != self._address for _, address in arrived), self._address, begun):
+                self._say_flooded(guard)
             for data, address in arrived:
                 frames = self._frames(data, address)
-                if not frames:  # junk, maybe a flood of it: nothing is done for it
+                if not frames:
                     continue
                 before = self.setpoints
                 self._stamp_us = max(self._stamp_us, clock.wall_us())  # of what waited behind others, too: it is that late
@@ -290,6 +294,15 @@ class Companion:
             if self._stop and not arrived:
                 return
             self._complain(begun - max(started, last_heard))
+
+    def _say_flooded(self, guard: Guard) -> None:
+        self.refused["floods"] = guard.raised
+        if guard.raised == 1:
+            print(
+                "a flood of datagrams from strangers: only the autopilot is listened to until it ends",
+                file=sys.stderr,
+                flush=True,
+            )
 
     def _hello(self, now_us: int) -> bytes:
         """A HEARTBEAT to whoever may be there, before anybody was heard."""
