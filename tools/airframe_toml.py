@@ -9,7 +9,7 @@ from mavquad import airframe, config
 from mavquad.airframe import Airframe
 from mavquad.errors import LogError
 from mavquad.identify.bounds import TICK_S
-from mavquad.identify.vehicle import Figure
+from mavquad.identify.vehicle import G_M_S2, Figure
 from tools.identified import Identified, Response
 
 if TYPE_CHECKING:
@@ -55,12 +55,13 @@ def written(found: Identified, base: Airframe, base_name: str, name: str, calibr
     ]
     if base.rotors is not None:
         r = base.rotors
+        full = base.body.mass_kg * G_M_S2 / (4.0 * hover) if thrust else r.thrust_max_n
         lines += [
             "",
             f"[rotors]  # from {base_name}",
             f"layout = {_text(r.layout)}",
             f"arm_m = {r.arm_m:g}",
-            f"thrust_max_n = {r.thrust_max_n:g}",
+            f"thrust_max_n = {full:.5g}" + ("  # weight over hover thrust, by rotor" if thrust else ""),
             f"thrust_min_n = {r.thrust_min_n:g}",
             f"torque_per_thrust_m = {r.torque_per_thrust_m:g}",
             f"lag_s = {r.lag_s:g}",

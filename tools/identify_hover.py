@@ -118,8 +118,11 @@ def doubts(found: Fit) -> list[str]:
         if cr > fit.INSENSITIVE_PCT and not name.startswith(structures.DELAY)
     ]
     free = found.structure.free
-    pairs = np.argwhere(np.abs(np.triu(found.correlation, 1)) > TIED)
-    notes += [f"{free[i]} and {free[j]} move together (correlation {found.correlation[i, j]:+.3f})" for i, j in pairs]
+    groups: list[set[int]] = []
+    for i, j in np.argwhere(np.abs(np.triu(found.correlation, 1)) > TIED).tolist():
+        touched = [group for group in groups if group & {i, j}]
+        groups = [group for group in groups if group not in touched] + [set().union({i, j}, *touched)]
+    notes += [f"{', '.join(free[i] for i in sorted(group))} move together (correlations above {TIED})" for group in groups]
     if not fit.CHI2_BAND[0] <= found.chi2 <= fit.CHI2_BAND[1]:
         notes.append(f"chi2 {found.chi2:.1f}: more than noise is left over; the bars are widened by its root")
     return notes

@@ -191,6 +191,16 @@ def test_what_is_wrong_with_a_log_is_said_in_one_line(change, line, tmp_path, ca
     assert [text for text in shown if line in text], "\n".join(shown)
 
 
+def test_the_rotors_of_the_file_lift_the_weight_at_the_hover_thrust_that_was_found(tmp_path):
+    """Else a simulator of this very file would hover at another thrust than its companion sends."""
+    out = tmp_path / "own.toml"
+    made = write_log(tmp_path / "hover.tlog", more=[imu(), target()])
+    assert program.main(["identify", str(made), "--out", str(out)]) == 0
+    loaded = airframe.load(str(out))
+    assert loaded.hover_thrust == pytest.approx(0.4, abs=0.001)
+    assert 4.0 * loaded.rotors.thrust_max_n * loaded.hover_thrust == pytest.approx(loaded.body.mass_kg * 9.80665, rel=1e-3)
+
+
 def test_a_log_without_attitude_and_a_missing_file_are_refused(tmp_path, capsys):
     path = tmp_path / "empty.tlog"
     raw = wire.encode("SYSTEM_TIME", (1, 2), seq=0, system=1, component=1)

@@ -8,6 +8,7 @@ import pytest
 from mavquad import airframe, sweep_flight, wire
 from mavquad.errors import ConfigError, LogError
 from mavquad.identify import fit, models, timebase
+from mavquad.identify.structures import REF_LON
 from mavquad.signals import NAN3, ZERO3, Demand, Estimate
 from mavquad.sweep_flight import LEAD_S, Params
 from tools import identify_hover, identify_log
@@ -152,6 +153,17 @@ def test_the_answer_is_taken_where_the_sticks_change_although_they_are_stamped_l
     for parameter in ("Z_w", "N_r", "N_ped", "K_r", "K_rfb", "Z_col", "N_col"):
         assert found.found.parameters[parameter] == pytest.approx(truth[parameter], rel=0.02), parameter
     assert abs(early.found.parameters["N_r"] / truth["N_r"] - 1.0) > 0.04  # a mere delay does not mend it
+
+
+def test_parameters_that_move_together_are_named_in_one_line_a_group():
+    alike = np.eye(10)
+    for i, j in ((2, 3), (3, 9), (4, 5)):
+        alike[i, j] = alike[j, i] = -0.99
+    found = fit.Fit(REF_LON, np.ones(10), np.full(10, 0.01), np.full(10, 0.01), alike, 1.0, 5.0, 100.0, 7, 7, 90)
+    assert identify_hover.doubts(found) == [
+        "M_a, A_c, tau_s move together (correlations above 0.98)",
+        "A_lon, A_lat move together (correlations above 0.98)",
+    ]
 
 
 def test_velocities_are_taken_along_the_body():
