@@ -19,8 +19,8 @@ def out(q=LEVEL.q_wxyz, w=ZERO, thrust=0.5, dt_s=0.1, last=LEVEL, gains=GAINS):
 
 
 def test_bits_and_defaults():
-    bits = (limits.NOT_FINITE, limits.TILT, limits.RATE, limits.THRUST, limits.TURN, limits.THRUST_SLEW)
-    assert bits == (1, 2, 4, 8, 16, 32)
+    bits = (limits.NOT_FINITE, limits.TILT, limits.RATE, limits.THRUST, limits.TURN, limits.THRUST_SLEW, limits.STICK)
+    assert bits == (1, 2, 4, 8, 16, 32, 64)
     d = limits.Limits()
     assert (d.tilt_deg, d.rate_deg_s, d.turn_deg_s) == (40.0, 200.0, 400.0)
     assert (d.thrust_min, d.thrust_max, d.thrust_slew_per_s) == (0.08, 0.95, 8.0)
@@ -119,3 +119,32 @@ def test_bits_add_up_and_the_mask_is_kept():
     assert (found.type_mask, found.thrust) == (128, 0.5)
     low = LEVEL._replace(thrust=0.9)
     assert out(thrust=2.0, dt_s=0.05, last=low)[1] == limits.THRUST_SLEW | limits.THRUST
+
+
+@pytest.mark.parametrize(
+    ("dt_s", "most"), [(0.01, 0.2), (0.04, 0.8), (0.1, 2.0), (0.5, 2.0), (0.0, 0.0), (-1.0, 0.0), (math.nan, 0.0)]
+)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_stick_moves_no_faster_than_it_may(dt_s, most, sign):
+    last = (-sign, -0.5 * sign, 0.0, 0.25 * sign)
+    found, bits = limits.sticks(last, (sign, sign, sign, sign), dt_s)
+    assert found == pytest.approx([sign * min(1.0, sign * x + most) for x in last])
+    assert bits == (0 if most == 2.0 else limits.STICK)
+
+
+@pytest.mark.parametrize("i", range(4))
+def test_a_stick_stays_inside_its_travel(i):
+    for last in (None, (0.9, 0.9, 0.9, 0.9)):
+        wanted = tuple(1.2 if j == i else 0.9 for j in range(4))
+        assert limits.sticks(last, wanted, 0.1) == (tuple(1.0 if j == i else 0.9 for j in range(4)), limits.STICK)
+    wanted = tuple(-1.2 if j == i else 0.0 for j in range(4))
+    assert limits.sticks(None, wanted, 0.0) == (tuple(-1.0 if j == i else 0.0 for j in range(4)), limits.STICK)
+    inside = tuple(0.4 if j == i else -0.3 for j in range(4))
+    assert limits.sticks(None, inside, 0.0) == (inside, 0)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_stick_that_is_no_number_stays_where_it_was(bad):
+    assert limits.sticks((0.1, 0.2, 0.3, 0.4), (bad, 0.2, 0.3, 0.4), 0.1) == ((0.1, 0.2, 0.3, 0.4), limits.NOT_FINITE)
+    assert limits.sticks(None, (0.1, bad, 0.3, 0.4), 0.1) == ((0.1, 0.0, 0.3, 0.4), limits.NOT_FINITE)
+    assert limits.sticks((0.0,) * 4, (bad, 1.0, 0.0, 0.0), 0.01)[1] == limits.NOT_FINITE | limits.STICK
