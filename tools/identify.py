@@ -148,6 +148,12 @@ def text(found: Identified) -> str:
             f"link              clock drift {flight.clock.drift_ppm:.0f} ppm, messages late by {1e3 * late[len(late) // 2]:.1f} ms"
             f" (median), {1e3 * late[int(0.99 * len(late))]:.1f} ms (99 %)"
         )
+    if flight.round_trip_s.size:
+        trip = sorted(flight.round_trip_s)
+        lines.append(
+            f"                  TIMESYNC answered after {1e3 * trip[len(trip) // 2]:.1f} ms (median), {1e3 * trip[int(0.99 * len(trip))]:.1f} ms"
+            f" (99 %), {len(trip)} of them"
+        )
     if found.noise:
         lines += ["", "noise (1 sigma): white, with the slow part"]
         lines += [f"  {name:28} {n.white:.2g}  {n.slow:.2g}" for name, n in found.noise.items()]

@@ -5,12 +5,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mavquad.identify import attitude
+from mavquad.identify import attitude, fit, structures
 from tools import bode, page
 from tools.identified import Identified, Response
 
 if TYPE_CHECKING:
     from tools.calibrate import Calibration
+    from tools.identify_hover import Hover
 
 
 def page_of(everything: Sequence[Identified], calibrations: "Sequence[Calibration]" = ()) -> str:
@@ -36,6 +37,8 @@ def _sections(found: Identified) -> list[tuple[str, list[str]]]:
     sections = [(f"{name}: what was found", [_models(found), _vehicle(found)])]
     for r in found.responses:
         sections.append((f"{r.axis} from {r.source}", _response(r)))
+    for h in found.hover:
+        sections.append((f"hover model, {h.name}", _hover(h)))
     noise = [[key, n.white, n.slow, n.step] for key, n in found.noise.items()]
     sections.append(("Noise of every stream (1 sigma)", [page.table(["field", "white", "with the slow part", "step"], noise)]))
     sections.append(("Not from this log", [page.text(text) for text in found.missing] or [page.text("nothing is missing")]))
@@ -67,6 +70,34 @@ def _vehicle(found: Identified) -> str:
         [f"torque/inertia {axis}, rad/s^2", t.gain_rad_s2.value, 2.0 * t.gain_rad_s2.sd] for axis, t in found.torque.items()
     ]
     return page.table(["vehicle", "value", "+-2 sigma"], rows)
+
+
+def _hover(h: "Hover") -> list[str]:
+    """Parameters with their bars, every pair that was told from the sweeps, the doublets that were not fitted."""
+    f, response = h.found, h.response
+    rows: list[list[object]] = [
+        [name, value, 2.0 * sd] for name, value, sd in zip(f.structure.free, f.theta.tolist(), f.sd.tolist(), strict=True)
+    ]
+    rows += [[f"{name} (held)", value, None] for name, value in f.structure.fixed.items()]
+    pieces = [
+        page.text(f"chi2 {f.chi2:.2f}, J {f.j:.0f}, {f.agreeing} of {f.starts} starts agree", "verdict"),
+        page.table(["parameter", "value", "+-2 sigma"], rows),
+        *(page.text(note) for note in h.notes),
+    ]
+    model = f.structure.build(f.parameters)
+    late = np.exp(-1j * response.omega_rad_s[:, None] * structures.delays_s(f.structure, f.parameters))
+    modelled = fit.sampled_response(model, response.omega_rad_s, response.dt_s) * late[:, None, :]
+    for i, output in enumerate(f.structure.outputs):
+        for j, stick in enumerate(f.structure.inputs):
+            if np.count_nonzero(response.coherence[:, i, j] >= fit.COHERENCE_FLOOR) >= fit.FEWEST_POINTS:
+                pieces += bode.bode(f"{output} from {stick}", response, (i, j), [("model", modelled[:, i, j])])
+    if h.check is not None:
+        t = response.dt_s * np.arange(len(h.check.measured))
+        for i, output in enumerate(f.structure.outputs):
+            lines = [page.line("measured", t, h.check.measured[:, i]), page.line("predicted", t, h.check.predicted[:, i], 1)]
+            title = f"{output} of doublets, not fitted, 3 s ahead: fit {h.check.fit_pct[i]:.1f} %, TIC {h.check.tic[i]:.3f}"
+            pieces.append(page.figure(title, lines, x="s", linked=h.name))
+    return pieces
 
 
 def _response(r: Response) -> list[str]:

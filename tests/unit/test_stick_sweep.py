@@ -11,7 +11,7 @@ from mavquad.identify import fit, models, timebase
 from mavquad.identify.structures import REF_LON
 from mavquad.signals import NAN3, ZERO3, Demand, Estimate
 from mavquad.sweep_flight import LEAD_S, Params
-from tools import identify_hover, identify_log
+from tools import identify_hover, identify_log, identify_page
 
 HELI = airframe.load("helicopter")
 SHORT = Params(axes=("pitch", "roll"), stick_sweep_s=30.0, stick_records=1, stick_quiet_s=3.0, check_s=16.0)
@@ -152,6 +152,9 @@ def test_the_answer_is_taken_where_the_sticks_change_although_they_are_stamped_l
     assert found.late_s == pytest.approx(-0.0046, abs=5e-4)
     for parameter in ("Z_w", "N_r", "N_ped", "K_r", "K_rfb", "Z_col", "N_col"):
         assert found.found.parameters[parameter] == pytest.approx(truth[parameter], rel=0.02), parameter
+    shown = "".join(identify_page._hover(found))
+    assert "N_ped" in shown
+    assert "r from ped" in shown  # its Bode plot
     assert abs(early.found.parameters["N_r"] / truth["N_r"] - 1.0) > 0.04  # a mere delay does not mend it
 
 
