@@ -8,7 +8,7 @@ import functools
 import re
 import tomllib
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -117,12 +117,23 @@ def _explain(text: str, data: dict[str, Any], kind: Any) -> str:
     if where:
         got: Any = data
         for part in filter(None, re.split(r"[.\[\]]+", where[1])):
+            kind = _inside(kind, part)
             try:
                 got = got[int(part)] if isinstance(got, list) else got[part]
             except (KeyError, IndexError, ValueError, TypeError):
                 return text.replace("$.", "").replace("$", "the top level")
+        if "enum" in text and get_args(kind):
+            return f"{where[1]} = {got!r}{_nearest(str(got), [str(name) for name in get_args(kind)])}"
         return f"{where[1]} = {got!r}: {text[: where.start()]}" if where[1] else text[: where.start()]
     return text
+
+
+def _inside(hint: Any, part: str) -> Any:
+    """The type of one field, item or value of a type; None where that is not plain."""
+    struct = _struct_of(hint)
+    if struct is not None and get_origin(hint) not in (list, tuple, dict):
+        return get_type_hints(struct).get(part)
+    return get_args(hint)[-1] if get_origin(hint) in (list, dict) else None
 
 
 def _struct_of(hint: Any) -> Any:

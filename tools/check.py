@@ -12,6 +12,7 @@ import json
 import math
 import tempfile
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -69,10 +70,12 @@ def check(endpoint_name: str, seconds: float, folder: Path) -> dict[str, Any]:
     companion = Companion(plan, endpoint, folder)
     timer = threading.Timer(seconds, companion.stop)
     timer.start()
+    begun_s = time.monotonic()
     try:
         companion.run()
     finally:
         timer.cancel()
+    seconds = max(0.1, min(seconds, round(time.monotonic() - begun_s, 1)))  # less where Ctrl-C ended it
     life = companion.flight.life
     if life.target == (0, 0):
         raise LinkError(

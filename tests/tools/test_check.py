@@ -2,9 +2,13 @@
 
 import json
 import math
+import os
+import re
+import signal
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -99,6 +103,29 @@ def test_nobody_there_is_said(capsys):
     assert "no HEARTBEAT of an autopilot in 2 s" in capsys.readouterr().err
     assert tools_main.main(["check", "udpin:127.0.0.1:1", "--seconds", "1"]) == 1
     assert "expected 2 to 3600" in capsys.readouterr().err
+
+
+def test_ctrl_c_ends_the_listening_and_the_time_said_is_the_time_listened(capsys):
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    done = threading.Event()
+
+    def press():
+        while not done.wait(0.2):
+            os.kill(os.getpid(), signal.SIGINT)
+
+    signal.signal(signal.SIGINT, lambda *_: None)  # until the companion heeds it
+    keyboard = threading.Thread(target=press)
+    keyboard.start()
+    try:
+        assert tools_main.main(["check", f"udpin:127.0.0.1:{_free_port()}", "--seconds", "60"]) == 1
+    finally:
+        done.set()
+        keyboard.join()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    said = re.search(r"no HEARTBEAT of an autopilot in ([\d.]+) s", capsys.readouterr().err)
+    assert said
+    assert float(said[1]) < 60.0
 
 
 def _free_port():

@@ -93,7 +93,8 @@ def test_datagrams_are_full_but_never_above_1400_bytes():
     [
         ("link.loss=1.5", r"link.loss = 1.5: expected 0 to 1"),
         ("link.losses=0.5", r'unknown key "losses" in \[link\]; did you mean "loss"\?'),
-        ("wind.rotor_model=X", r"wind.rotor_model = 'X'"),
+        ("wind.rotor_model=X", r"wind.rotor_model = 'X'; known: G, P, none"),
+        ('faults=[{kind="moto", t_s=1.0}]', r"faults\[0\].kind = 'moto'; did you mean \"motor\"\?"),
         ("noise.mocap_rate_hz=333", r"noise.mocap_rate_hz = 333: expected 1, 2, 5"),
         ("control_period_ms=7", r"control_period_ms = 7: expected 1 to 100 ms, a multiple of the loop's 2 ms"),
         ("start.p_ned_m=[0, 0, 1]", r"not below the ground"),
