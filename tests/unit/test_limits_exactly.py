@@ -54,7 +54,7 @@ def test_a_quaternion_of_about_unit_size_is_made_one(size, taken):
 
 
 @pytest.mark.parametrize(
-    ("dt_s", "counted_s"), [(0.05, 0.05), (0.1, 0.1), (0.5, 0.1), (0.0, 0.0), (-1.0, 0.0), (math.nan, 0.0)]
+    ("dt_s", "counted_s"), [(0.05, 0.05), (0.095, 0.095), (0.1, 0.1), (0.5, 0.1), (0.0, 0.0), (-1.0, 0.0), (math.nan, 0.0)]
 )
 def test_slew_over_the_time_that_counts(dt_s, counted_s):
     found, _ = out(thrust=0.95, dt_s=dt_s, last=LEVEL._replace(thrust=0.1))
