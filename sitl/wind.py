@@ -7,6 +7,7 @@ Deviations from the paper:
   V          the airspeed of the filters is frozen (a hovering vehicle has none of its own), never below 1 m/s
 """
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -56,6 +57,7 @@ def mean_at(w20_m_s: float, height_m: float) -> float:
     return w20_m_s * max(0.0, math.log(max(1e-9, height_m / FOOT_M) / 0.15) / math.log(20.0 / 0.15))
 
 
+@functools.lru_cache(maxsize=64)  # the flights of a campaign mostly share it
 def dryden(w20_m_s: float, height_m: float, span_m: float, airspeed_m_s: float, dt_s: float = SAMPLE_S) -> Dryden:
     """The turbulence at one height and airspeed, discretised exactly for dt_s."""
     i = intensity(w20_m_s, height_m, span_m)
