@@ -5,7 +5,7 @@ import json
 import sys
 from pathlib import Path
 
-from mavquad.errors import MavquadError
+from mavquad.errors import ConfigError, MavquadError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -37,13 +37,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--lockstep", action="store_true", help="vehicle time waits for us (the simulated autopilot must be started so too)"
     )
+    parser.add_argument(
+        "--realtime", action="store_true", help="run ahead of all ordinary processes (SCHED_FIFO of Linux; it must be allowed)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Fly until Ctrl-C or SIGTERM; one line of JSON about it on stdout at the end."""
+    from mavquad import realtime
     from mavquad.link import clock
     from mavquad.link.endpoint import open_endpoint
 
+    if args.realtime:
+        if args.lockstep:
+            raise ConfigError("--realtime with --lockstep: a vehicle that waits for us needs no haste; leave one of them away")
+        realtime.ask()
     endpoint = open_endpoint(args.endpoint)  # first: what is wrong with it is known before anything is compiled
     further = [(open_endpoint(name), name) for name in args.forward]
     from mavquad import config, pipeline, plan_file, settings, warm
