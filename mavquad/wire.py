@@ -27,9 +27,14 @@ STX_V2 = 0xFD
 SIGNED = 0x01  # incompatibility flag
 SIGNATURE_LENGTH = 13
 MAX_FRAME = 10 + 255 + 2 + SIGNATURE_LENGTH
-_HEADER_V2 = struct.Struct("<BBBBBBBHB")  # STX, length, two flags, sequence, system, component, message id
+_HEADER_V2 = struct.Struct("<BBBBBBHB")  # (STX,) length, two flags, sequence, system, component, message id
+_READ_V2 = struct.Struct("<xBBxBBBHB").unpack_from  # the same as it is read, without STX and the second flags
 _HEADER_V1 = struct.Struct("<BBBBBB")  # STX, length, sequence, system, component, message id
 _CRC = struct.Struct("<H")
+
+
+_MISFITS = (struct.error, IndexError, TypeError, OverflowError)
+_new = tuple.__new__
 
 
 class Frame(NamedTuple):
@@ -90,8 +95,12 @@ class Spec:
         """The payload, untrimmed. Raises WireError where a field does not fit its type."""
         try:
             return self._pack(fields)
-        except (struct.error, IndexError, TypeError, OverflowError) as error:
-            raise WireError(f"{self.name}{tuple(fields)!r} does not fit its layout {self.struct.format}: {error}") from None
+        except _MISFITS as error:
+            raise self.misfit(fields, error) from None
+
+    def misfit(self, fields: tuple[Any, ...], error: Exception) -> WireError:
+        """Fields that `pack` cannot take."""
+        return WireError(f"{self.name}{tuple(fields)!r} does not fit its layout {self.struct.format}: {error}")
 
 
 class _Specs(dict[int, Spec]):
@@ -124,10 +133,13 @@ def spec(name: str) -> Spec:
 def encode(name: str, fields: tuple[Any, ...], *, seq: int, system: int, component: int) -> bytes:
     """One unsigned MAVLink 2 frame. Raises WireError where the fields do not fit."""
     s = _BY_NAME.get(name) or spec(name)
-    payload = s.pack(fields).rstrip(b"\0") or b"\0"
+    try:
+        payload = s._pack(fields).rstrip(b"\0") or b"\0"
+    except _MISFITS as error:
+        raise s.misfit(fields, error) from None
     low, high = s._id
-    body = _HEADER_V2.pack(STX_V2, len(payload), 0, 0, seq & 0xFF, system, component, low, high) + payload
-    return body + _CRC.pack(mcrf4xx(body[1:] + s._extra))
+    body = _HEADER_V2.pack(len(payload), 0, 0, seq & 0xFF, system, component, low, high) + payload
+    return b"\xfd" + body + _CRC.pack(mcrf4xx(body + s._extra))
 
 
 def split(data: bytes) -> tuple[list[Frame], int, bytes]:
@@ -144,12 +156,14 @@ def split(data: bytes) -> tuple[list[Frame], int, bytes]:
         if stx == STX_V2:
             if size - at < 10:
                 break
-            _, length, flags, _, seq, system, component, low, high = _HEADER_V2.unpack_from(data, at)
+            length, flags, seq, system, component, low, high = _READ_V2(data, at)
             msgid, crc_at = low | high << 16, at + 10 + length
-            end = crc_at + 2 + (SIGNATURE_LENGTH if flags & SIGNED else 0)
-            if flags & ~SIGNED:  # flags that nobody understands: the frame must not be taken
-                at, refused = at + 1, refused + 1
-                continue
+            end = crc_at + 2
+            if flags:
+                if flags & ~SIGNED:  # flags that nobody understands: the frame must not be taken
+                    at, refused = at + 1, refused + 1
+                    continue
+                end += SIGNATURE_LENGTH
         elif stx == STX_V1:
             if size - at < 6:
                 break
@@ -167,11 +181,11 @@ def split(data: bytes) -> tuple[list[Frame], int, bytes]:
         if (
             data[end : end + 1] not in _BEGINS
             if extra is None
-            else _CRC.unpack_from(data, crc_at)[0] != mcrf4xx(data[at + 1 : crc_at] + extra)
+            else data[crc_at] | data[crc_at + 1] << 8 != mcrf4xx(data[at + 1 : crc_at] + extra)
         ):
             at, refused = at + 1, refused + 1
             continue
-        frames.append(tuple.__new__(Frame, (data[at:end], msgid, system, component, seq)))
+        frames.append(_new(Frame, (data[at:end], msgid, system, component, seq)))
         at = end
     return frames, refused, data[at:]
 
@@ -199,7 +213,10 @@ def decode(frame: Frame) -> Any:
     except KeyError:
         raise WireError(f"message id {frame.msgid} from {frame.system}/{frame.component} is in no known dialect") from None
     raw = frame.raw
-    return s.unpack(raw[10 : 10 + raw[1]] if raw[0] == STX_V2 else raw[6 : 6 + raw[1]])
+    payload = raw[10 : 10 + raw[1]] if raw[0] == STX_V2 else raw[6 : 6 + raw[1]]
+    if len(payload) < s.length:
+        payload = payload.ljust(s.length, b"\0")
+    return s._unpack(s.struct.unpack_from(payload))
 
 
 def addressee(frame: Frame) -> tuple[int, int]:
