@@ -38,7 +38,7 @@ def _begun(gains, start, v, attitude, thrust):
         z, inner.p.copy(), inner.guarantee, inner.clean, inner.empty, inner.inflations, inner.delta, inner.n_bad.copy(),
         inner.inflated_us.copy(),
     )  # fmt: skip
-    return quad_error.State(fresh, start.intervals, thrust, attitude)
+    return quad_error.State(fresh, start.intervals, thrust, attitude, 0.0)
 
 
 @kernel

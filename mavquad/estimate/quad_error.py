@@ -27,6 +27,7 @@ Vec3 = tuple[float, float, float]
 G_M_S2 = 9.80665
 N_STATES, N_OUTPUTS = 10, 8
 V, F, ATT, F_ATT = 0, 3, 6, 8  # where each part begins among the states
+SLEW_S = 0.08  # for how long a change of the thrust may still be on its way
 Y_ATT, Y_V, Y_F = 0, 2, 5  # outputs, in the order in which strips are taken: attitude, velocity, acceleration
 
 
@@ -57,6 +58,7 @@ class State(NamedTuple):
     intervals: tuple[interval.State, interval.State, interval.State]
     thrust_m_s2: float  # T_m
     attitude_rad: Vec3  # roll, pitch, yaw last measured
+    slew_m_s3: float  # of T_m, the largest of the last moments
 
 
 class Measured(NamedTuple):
@@ -100,7 +102,7 @@ def init(gains: Gains, velocity_ned_m_s: Vec3, attitude_rad: Vec3, thrust_m_s2: 
     x[V : V + 3] = velocity_ned_m_s
     x[ATT : ATT + 2] = attitude_rad[:2]
     unknown = interval.init()
-    return State(asmf.init(gains.filter, x), (unknown, unknown, unknown), thrust_m_s2, attitude_rad)
+    return State(asmf.init(gains.filter, x), (unknown, unknown, unknown), thrust_m_s2, attitude_rad, 0.0)
 
 
 @kernel
@@ -197,12 +199,19 @@ def step(gains: Gains, state: State, command: Vec3, measured: Measured, dt_s: fl
     y = outputs(measured, attitude, thrust)
     a_ned = linalg.add(after, (inner.x[F], inner.x[F + 1], inner.x[F + 2]))
     late = widening(gains, measured, rate, attitude, a_ned, y)
+    # the thrust that acts may be a moment before or behind the model's: while it changes f may jump by as much
+    slew = state.slew_m_s3 * math.exp(-dt_s / SLEW_S)
+    if dt_s > 0.0:
+        slew = max(slew, abs(thrust - state.thrust_m_s2) / dt_s)
+    up = quat.rotate(quat.from_euler(attitude[0], attitude[1], attitude[2]), (0.0, 0.0, slew * dt_s))
+    for i in range(3):
+        late[Y_F + i] += abs(up[i]) * min(1.0, measured.accel_age_s / max(dt_s, 1e-6))
     inner = asmf.update(gains.filter, inner, y, late, t_us)
     b, e, ix, iy, iz = gains.b_f_m_s2 * ticks, gains.filter.e, state.intervals[0], state.intervals[1], state.intervals[2]
-    ix = interval.update(interval.predict(ix, b), y[Y_F], e[Y_F] + late[Y_F])
-    iy = interval.update(interval.predict(iy, b), y[Y_F + 1], e[Y_F + 1] + late[Y_F + 1])
-    iz = interval.update(interval.predict(iz, b), y[Y_F + 2], e[Y_F + 2] + late[Y_F + 2])
-    return State(inner, (ix, iy, iz), thrust, attitude)
+    ix = interval.update(interval.predict(ix, b + abs(up[0])), y[Y_F], e[Y_F] + late[Y_F])
+    iy = interval.update(interval.predict(iy, b + abs(up[1])), y[Y_F + 1], e[Y_F + 1] + late[Y_F + 1])
+    iz = interval.update(interval.predict(iz, b + abs(up[2])), y[Y_F + 2], e[Y_F + 2] + late[Y_F + 2])
+    return State(inner, (ix, iy, iz), thrust, attitude, slew)
 
 
 @kernel

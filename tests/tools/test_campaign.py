@@ -70,7 +70,7 @@ def test_the_owners_questions_are_the_campaigns():
     assert (mpc.sitl.wind.rotor_model, mpc.sitl.link.delay_ms, mpc.sitl.link.jitter_ms) == ("G", 35, 10)
     gusts = over_udp.resolve(next(grid.flights(grid.load("asmf"))).words)[1].sitl.wind.gusts
     assert all(3.0 <= gust.speed_m_s <= 6.0 for gust in gusts)
-    assert len(gusts) == 3
+    assert len(gusts) == 6
 
 
 def test_variants_meet_the_same_draws_and_other_seeds_other_ones(file):

@@ -2,16 +2,18 @@
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
 from mavquad import active_flight, airframe, quat
 from mavquad.compensate import active_model
 from mavquad.errors import ConfigError
+from mavquad.estimate import quad_error
 from mavquad.signals import NAN3, ZERO3, Applied, Attitude, Command, Estimate, Imu, Position, Target
 
 G_M_S2 = 9.80665
-X500 = airframe.load("x500")
+X500 = msgspec.structs.replace(airframe.load("x500"), bounds=airframe.ModelBounds())  # errors as the design note has them
 DT_S = 0.008
 PUSH = (0.8, -0.5, 0.6)
 
@@ -199,3 +201,23 @@ def test_attitude_and_acceleration_are_inverse(yaw):
         a = tuple(rng.uniform(-6, 6, 3))
         attitude = active_model.attitude_for(a, yaw)
         np.testing.assert_allclose(active_model.acceleration_of(attitude, yaw), a, atol=1e-9)
+
+
+def test_while_the_thrust_changes_the_published_bounds_allow_for_its_delay():
+    """The thrust acts 10 ms later than the model thinks: f is off by as much as the thrust has moved."""
+    model = quad_error.gains(quad_error.Params(thrust_lag_s=0.03))
+    state = quad_error.init(model, ZERO3, ZERO3, G_M_S2)
+    command, thrust, outside, width = G_M_S2, [G_M_S2] * 2, 0, []
+    for k in range(1, 800):
+        if k % 25 == 0:
+            command = G_M_S2 + (2.5 if k % 50 else -2.5)
+        thrust.append(quad_error.thrust_after(thrust[-1], command, 0.03, 0.008))
+        acts = thrust[-2] + 0.25 * (thrust[-3] - thrust[-2])
+        felt = 0.5 * (acts + thrust[-3])  # the mean over the tick is 4 ms old
+        measured = quad_error.Measured(ZERO3, NAN3, (0.0, 0.0, -felt), 0.0, 0.0, 0.004)
+        state = quad_error.step(model, state, (0.0, 0.0, command), measured, 0.008, 8000 * k)
+        cut, f = quad_error.bounds_f(state, 2), state.thrust_m_s2 - acts
+        outside += not cut.low <= f <= cut.high
+        width.append(cut.high - cut.low)
+    assert outside == 0
+    assert np.median(width) < 2.0

@@ -45,3 +45,10 @@ def test_a_missing_and_a_broken_file(tmp_path):
     (tmp_path / "b.toml").write_text("a = = 1")
     with pytest.raises(ConfigError, match="not valid TOML"):
         airframe.load(str(tmp_path / "b.toml"))
+
+
+def test_the_x500_flies_with_bounds_of_its_own_log_and_the_guess_stays_the_note_s():
+    own, guess = airframe.load("x500").bounds, airframe.ModelBounds()
+    assert own != guess
+    assert own.e_velocity_m_s > 3.0 * 0.03  # three sigma of what it is sent
+    assert airframe.load("helicopter").bounds == guess  # none from a log: its filter has bounds of its own
