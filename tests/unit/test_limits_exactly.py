@@ -148,3 +148,20 @@ def test_a_stick_that_is_no_number_stays_where_it_was(bad):
     assert limits.sticks((0.1, 0.2, 0.3, 0.4), (bad, 0.2, 0.3, 0.4), 0.1) == ((0.1, 0.2, 0.3, 0.4), limits.NOT_FINITE)
     assert limits.sticks(None, (0.1, bad, 0.3, 0.4), 0.1) == ((0.1, 0.0, 0.3, 0.4), limits.NOT_FINITE)
     assert limits.sticks((0.0,) * 4, (bad, 1.0, 0.0, 0.0), 0.01)[1] == limits.NOT_FINITE | limits.STICK
+
+
+@pytest.mark.parametrize("yaw", [0.0, 1.0, -2.0, 3.0])
+def test_a_lean_too_far_keeps_its_heading_and_its_direction(yaw):
+    wanted = quat.from_euler(0.9, 0.0, yaw)
+    last = LEVEL._replace(q_wxyz=quat.from_euler(0.6, 0.0, yaw))
+    found, bits = out(wanted, last=last)
+    assert bits == limits.TILT
+    assert found.q_wxyz == pytest.approx(quat.from_euler(math.radians(40.0), 0.0, yaw), abs=1e-12)
+
+
+def test_upside_down_to_a_billionth_has_no_heading_to_keep():
+    last = LEVEL._replace(q_wxyz=(0.0, 1.0, 0.0, 0.0))
+    nearly, bits = out((9.5e-10, 1.0, 0.0, 0.0), last=last)
+    assert (nearly.q_wxyz, bits) == (last.q_wxyz, limits.TILT)
+    found, _ = out((1.1e-9, 1.0, 0.0, 0.0), last=last)
+    assert found.q_wxyz == pytest.approx((math.cos(math.radians(20.0)), math.sin(math.radians(20.0)), 0.0, 0.0))
