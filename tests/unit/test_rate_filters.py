@@ -35,6 +35,14 @@ def test_zero_phase_does_not_move_a_slow_signal_and_squares_the_attenuation():
     assert twice == pytest.approx(once**2, rel=0.02)
 
 
+def test_the_low_pass_is_scipys_at_rest_on_the_first_value():
+    x = np.random.default_rng(2).standard_normal((40, 2))
+    b, a = signal.butter(2, 5.0, fs=1.0 / H)
+    rest = signal.lfilter_zi(b, a)[:, None] * x[0]
+    wanted, _ = signal.lfilter(b, a, x, axis=0, zi=rest)
+    np.testing.assert_allclose(rate_filters.low_pass(x, 5.0, H), wanted, atol=1e-12)
+
+
 def test_zero_phase_goes_on_straight_at_both_ends():
     ramp = (3.0 + 2.0 * T)[:, None]
     np.testing.assert_allclose(rate_filters.zero_phase(ramp, 5.0, H), ramp, atol=0.05)
