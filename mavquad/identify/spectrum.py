@@ -6,6 +6,9 @@ Deviations from the paper:
   Eqs. (10), (11)  densities carry Ts^2 and the window's power; this cancels in Eq. (12).
   Eq. (12)  H = G_yr G_ur^-1 from the injected excitation r, several inputs at once (joint input-output): G_uy/G_uu is biased
             when feedback makes u depend on the noise, and an unstable vehicle is always swept in closed loop.
+  LPM       the response is a cubic of frequency where that leaves half of the bins free, the leakage a quadratic: with quadratics
+            for both, as usual, the lightly damped closed loop of a helicopter bends more than they follow, which costs 4 % of u at
+            0.8 rad/s, always to the same side.
   Eq. (13)  the coherence is the one equivalent to the estimated standard deviation, 1/(1 + dof sd^2).
 """
 
@@ -75,7 +78,7 @@ def log_grid(lo_rad_s: float, hi_rad_s: float, count: int = 40) -> np.ndarray:
 
 
 def lpm(records: Sequence[Record], omega_rad_s: np.ndarray) -> Response:
-    """Local polynomial method: the response and the leakage of every record are quadratics of frequency around each bin.
+    """Local polynomial method: around each bin the response is a cubic of frequency, the leakage of every record a quadratic.
 
     The frequencies come back as the nearest bins of the first record. Raises LogError where the records cannot tell the inputs
     apart.
@@ -161,12 +164,13 @@ def _local(spectra: list[tuple[np.ndarray, np.ndarray, np.ndarray]], centre: flo
         places.append(first + inside)
         first += omega.size
         s = ((omega[inside] - centre) / half)[:, None]
-        powers = np.hstack([np.ones_like(s), s, s * s])
         transient = np.zeros((inside.size, 3 * len(spectra)))
-        transient[:, 3 * i : 3 * i + 3] = powers
-        rows.append(np.hstack([r[inside], s * r[inside], s * s * r[inside], transient]))
+        transient[:, 3 * i : 3 * i + 3] = s ** np.arange(3)
+        rows.append(np.hstack([*(s**power * r[inside] for power in range(4)), transient]))
         wanted.append(z[inside])
     phi, target = np.vstack(rows), np.vstack(wanted)
+    if phi.shape[0] < 2 * phi.shape[1]:
+        phi = np.delete(phi, np.s_[3 * m : 4 * m], axis=1)
     dof = phi.shape[0] - phi.shape[1]
     scale = np.linalg.norm(phi, axis=0)
     if np.any(scale == 0.0) or dof < 1:
