@@ -64,7 +64,7 @@ def written(found: Identified, base: Airframe, base_name: str, name: str, calibr
             f"thrust_max_n = {full:.5g}" + ("  # weight over hover thrust, by rotor" if thrust else ""),
             f"thrust_min_n = {r.thrust_min_n:g}",
             f"torque_per_thrust_m = {r.torque_per_thrust_m:g}",
-            f"lag_s = {r.lag_s:g}",
+            f"lag_s = {found.lift.lag_s:.4g}  # +-{2.0 * found.lift.sd[1]:.2g}" if found.lift else f"lag_s = {r.lag_s:g}",
         ]
     lines += ["", "[drag]"]
     if found.drag is not None:

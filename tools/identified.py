@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 import numpy as np
 
 from mavquad.errors import LogError
-from mavquad.identify import attitude, doubts, noise, timebase, vehicle, verify
+from mavquad.identify import attitude, doubts, lift, noise, timebase, vehicle, verify
 from mavquad.identify.attitude import Axis, Parts, SecondOrder
+from mavquad.identify.lift import Lift
 from mavquad.identify.noise import Noise
 from mavquad.identify.timebase import Held, Sampled
 from mavquad.identify.vehicle import Drag, GyroFilter, Thrust, Torque
+from tools import identify_doubts
 from tools.identify_log import Flight, Setpoints, sampled
 
 if TYPE_CHECKING:
@@ -79,6 +81,7 @@ class Identified(NamedTuple):
     missing: tuple[str, ...]  # what cannot be identified from this log, and what to record
     notes: tuple[str, ...]
     hover: tuple["Hover", ...] = ()  # of a helicopter whose sticks were swept
+    lift: Lift | None = None  # of a vehicle whose thrust was swept
 
     def of(self, source: str) -> list[Response]:
         return [r for r in self.responses if r.source == source]
@@ -103,7 +106,7 @@ def identify(flight: Flight, fit_s: Span | None = None, check_s: Span | None = N
             if got is not None:
                 responses.append(got)
     motion = sampled(flight)
-    foreign = foreign_axes(flight, motion)
+    foreign = identify_doubts.foreign_axes(flight, motion)
 
     def own(work: Callable[[], T], *streams: str) -> Callable[[], T]:
         """The work, or a refusal where one of its streams has other axes than expected."""
@@ -117,6 +120,7 @@ def identify(flight: Flight, fit_s: Span | None = None, check_s: Span | None = N
         return refusing
 
     thrust = _try(missing, "hover thrust", own(lambda: vehicle.hover(motion), "accelerometer"))
+    lifted = _try(missing, "thrust response", own(partial(_lift, flight), "accelerometer"))
     drag = _try(missing, "drag", own(lambda: vehicle.drag(motion), "accelerometer", "velocity"))
     gyro: dict[str, GyroFilter] = {}
     torque: dict[str, Torque] = {}
@@ -127,10 +131,24 @@ def identify(flight: Flight, fit_s: Span | None = None, check_s: Span | None = N
         about = f"torque per command, {axis}"
         if turned := _try(missing, about, own(partial(_torque, flight, i, spans), f"gyro {axis}")):
             torque[axis] = turned
-    notes = [*flight.notes, *_recording(flight, responses), *_doubts(responses)]
+    notes = [
+        *flight.notes,
+        *identify_doubts.recording(flight, {(r.axis, r.source): r.found.fitted_from for r in responses}),
+        *_doubts(responses),
+    ]
     hover = _hover(flight, missing)
     return Identified(
-        flight, tuple(responses), gyro, thrust, drag, torque, noises(flight), (*missing, *UNKNOWABLE), tuple(notes), hover
+        flight,
+        tuple(responses),
+        gyro,
+        thrust,
+        drag,
+        torque,
+        noises(flight),
+        (*missing, *UNKNOWABLE),
+        tuple(notes),
+        hover,
+        lifted,
     )
 
 
@@ -194,6 +212,22 @@ def _gyro(flight: Flight, i: int, spans: Sequence[Span]) -> GyroFilter:
     return vehicle.gyro_filter(dt, angle, rate)[0]
 
 
+def _lift(flight: Flight) -> Lift:
+    commands = flight.sent or flight.target
+    if flight.sticks is not None:
+        raise LogError("the sticks were swept in this log, not the thrust")
+    if commands is None or flight.imu is None:
+        raise LogError("no thrust (SET_ATTITUDE_TARGET) beside an accelerometer (HIGHRES_IMU); record both at 50 Hz or more")
+    inside = doubts.inside(commands.t_s, flight.flying)
+    t, thrust = commands.t_s[inside], commands.thrust[inside]
+    if len(t) < 100:
+        raise LogError("no thrust commanded in flight; sweep it (mavquad fly sweep --axis thrust)")
+    chosen = attitude.parts(t, thrust[:, None], 0)
+    if not chosen.swept:
+        raise LogError("thrust was never swept; mavquad fly sweep --axis thrust")
+    return lift.lift(Held(t, thrust), Sampled(flight.imu.t_s, -flight.imu.first[:, 2]), chosen.fit)
+
+
 def _torque(flight: Flight, i: int, spans: Sequence[Span]) -> Torque:
     if flight.motors is None:
         raise LogError("no SERVO_OUTPUT_RAW with moving motors in this log; ask for it at 50 Hz")
@@ -241,49 +275,6 @@ def _try(missing: list[str], what: str, work: Callable[[], T]) -> T | None:
     except LogError as error:
         missing.append(f"{what}: {error}")
         return None
-
-
-def foreign_axes(flight: Flight, motion: vehicle.Motion) -> dict[str, str]:
-    """Streams whose signs are not those of NED and FRD, with what is wrong: told by what they are the derivative of."""
-    air = motion.flying
-    found: dict[str, str] = {}
-    expected = "have the sender use NED and FRD, or convert the log"
-    if flight.imu is not None and doubts.upside_down(motion.accel_m_s2[air, 2]):
-        shown = float(np.median(motion.accel_m_s2[air, 2]))
-        found["accelerometer"] = f"{flight.imu.source}.zacc shows {shown:+.1f} m/s^2 in flight, FRD shows -9.8; {expected}"
-    turn = flight.attitude
-    own = np.column_stack([np.interp(motion.t_s, turn.t_s, turn.rate_rad_s[:, i]) for i in range(3)])
-    for i, axis in enumerate(AXES):
-        for what, source, rates in (
-            ("rate", f"{turn.source}.{axis}speed", own),
-            ("gyro", f"{flight.imu.source}.{'xyz'[i]}gyro" if flight.imu else "", motion.gyro_rad_s),
-        ):
-            if source and doubts.against(rates[air, i], motion.euler_rad[air, i], motion.dt_s):
-                found[f"{what} {axis}"] = f"{source} runs against the change of {turn.source}.{axis}; {expected}"
-    if (there := flight.position) is not None:
-        slow = np.arange(there.t_s[0], there.t_s[-1], 0.4)
-        for i, axis in enumerate("xyz"):
-            p, v = (np.interp(slow, there.t_s, column[:, i]) for column in (there.first, there.second))
-            if doubts.against(v, p, 0.4):
-                found["velocity"] = f"{there.source}.v{axis} runs against the change of {axis}; {expected}"
-    return found
-
-
-def _recording(flight: Flight, responses: Sequence[Response]) -> list[str]:
-    """Gaps, jitter and limits in what was fitted (in flight, where nothing was)."""
-    spans = tuple(span for r in responses for span in r.found.fitted_from) or flight.flying
-    notes: list[str] = []
-    streams = [flight.attitude, *(s for s in (flight.target, flight.imu, flight.position) if s is not None)]
-    for stream in streams:
-        notes += doubts.rhythm(stream.source, stream.t_s, "ask for 50 or 100 Hz over a link that carries it", spans)
-    if flight.motors is not None:
-        notes += doubts.motors_at_limit(*flight.motors, spans)
-    if flight.sent is not None and flight.target is not None:
-        for i, axis in enumerate(AXES[:2]):
-            mine = tuple(s for r in responses if r.axis == axis and r.source == flight.sent.source for s in r.found.fitted_from)
-            pair = [Held(s.t_s, s.euler_rad[:, i]) for s in (flight.sent, flight.target)]
-            notes += doubts.command_cut(axis, pair[0], pair[1], mine)
-    return notes
 
 
 def _doubts(responses: Sequence[Response]) -> list[str]:
@@ -339,6 +330,7 @@ def summary(found: Identified) -> dict[str, Any]:
         "gyro_filter": {k: {"cutoff_hz": v.cutoff_hz.value, "sd": v.cutoff_hz.sd, "lag_s": v.lag_s} for k, v in found.gyro.items()},
         "hover_thrust": figure(found.thrust.hover) if found.thrust else None,
         "thrust_gain_m_s2": figure(found.thrust.gain_m_s2) if found.thrust else None,
+        "thrust_response": dict(zip(("gain_m_s2", "lag_s", "delay_s", "sd", "chi2"), found.lift[:5], strict=True)) if found.lift else None,
         "thrust_over_cosine": found.thrust.over_cosine if found.thrust else None,
         "drag": {
             "linear_1_s": [figure(f) for f in found.drag.linear_1_s],

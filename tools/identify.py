@@ -126,6 +126,12 @@ def text(found: Identified) -> str:
         lines.append(
             f"hover thrust      {_pm(t.hover.value, t.hover.sd, 4)}; thrust gain {_pm(t.gain_m_s2.value, t.gain_m_s2.sd, 2)} m/s^2{divides}"
         )
+    if found.lift:
+        up = found.lift
+        lines.append(
+            f"thrust response   lag {_pm(1e3 * up.lag_s, 1e3 * up.sd[1], 1)} ms, delay {_pm(1e3 * up.delay_s, 1e3 * up.sd[2], 1)} ms,"
+            f" gain {_pm(up.gain_m_s2, up.sd[0], 2)} m/s^2, chi2 {up.chi2:.1f}"
+        )
     if found.drag:
         d = found.drag
         for i, axis in enumerate(("forward", "right")):

@@ -62,6 +62,9 @@ def _vehicle(found: Identified) -> str:
     if found.thrust:
         rows += [["hover thrust", found.thrust.hover.value, 2.0 * found.thrust.hover.sd]]
         rows += [["thrust gain, m/s^2", found.thrust.gain_m_s2.value, 2.0 * found.thrust.gain_m_s2.sd]]
+    if found.lift:
+        for label, value, sd in zip(("gain, m/s^2", "lag, s", "delay, s"), found.lift[:3], found.lift.sd, strict=True):
+            rows += [[f"thrust response {label}", value, 2.0 * sd]]
     if found.drag:
         for axis, a, b in zip(("forward", "right"), found.drag.linear_1_s, found.drag.quadratic_1_m, strict=True):
             rows += [[f"drag {axis}, 1/s", a.value, 2.0 * a.sd], [f"drag {axis}, 1/m", b.value, 2.0 * b.sd]]

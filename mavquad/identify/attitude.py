@@ -56,16 +56,16 @@ class Axis(NamedTuple):
 
 
 def measured(
-    u: Held, y: Sampled, spans: Sequence[Span], lo_hz: float, hi_hz: float, count: int = 40
+    u: Held, y: Sampled, spans: Sequence[Span], lo_hz: float, hi_hz: float, count: int = 40, what: str = "attitude"
 ) -> tuple[Response, list[Record]]:
-    """The continuous response from a held command to sampled attitude over the given spans of time, and its even records.
+    """The continuous response from a held command to a sampled answer (`what`) over the given spans of time, and its even records.
 
     Raises LogError where the telemetry is too slow, full of gaps, or the command does not move.
     """
     steady = timebase.rhythm(y.t_s)
     if steady.period_s > SLOWEST_PERIOD_S:
         raise LogError(
-            f"attitude comes at {1 / steady.period_s:.1f} Hz; needs {1 / SLOWEST_PERIOD_S:.0f} Hz or more, 50-100 Hz is good"
+            f"{what} comes at {1 / steady.period_s:.1f} Hz; needs {1 / SLOWEST_PERIOD_S:.0f} Hz or more, 50-100 Hz is good"
         )
     dt = steady.period_s
     records = []
@@ -78,13 +78,13 @@ def measured(
             records.append(Record(dt, mean, mean, np.interp(t, y.t_s, y.value)[:, None]))
     if not records:
         raise LogError(
-            f"no stretch of {spectrum.SHORTEST_S:g} s without a gap in both command and attitude; record a sweep of 70 s"
+            f"no stretch of {spectrum.SHORTEST_S:g} s without a gap in both command and {what}; record a sweep of 70 s"
         )
     moved = max(float(np.std(record.r)) for record in records)
     if moved < EXCITED_RAD:
-        raise LogError(
-            f"the command moves by {np.degrees(moved):.2f} deg rms only (needs {np.degrees(EXCITED_RAD):.1f}); record a sweep"
-        )
+        told = f"{np.degrees(moved):.2f} deg" if what == "attitude" else f"{100.0 * moved:.2f} % of full"
+        needs = f"{np.degrees(EXCITED_RAD):.1f} deg" if what == "attitude" else f"{100.0 * EXCITED_RAD:.0f} %"
+        raise LogError(f"the command moves by {told} rms only (needs {needs}); record a sweep")
     longest = max(len(record.r) for record in records) * dt
     lo = max(lo_hz, 1.0 / longest)
     hi = min(hi_hz, 0.35 / dt)
