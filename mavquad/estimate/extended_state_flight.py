@@ -10,6 +10,8 @@ Deviations from the paper (beside those of `extended_state_kf.py`):
   drag      modelled from the airframe file, so that f changes with the wind and not with the path.
   offset    telemetry's velocity is not the derivative of its position (0.02 m/s is common), which holds any filter that trusts
             both some centimetres off: the slow part of the position is anchored to the raw one.
+  Q         a share of the growth of f, by whether innovations of velocity resemble the ones before (Mehra 1970): calm air is not
+            answered with the noise that gusts are worth.
   R         adapted from the residuals, if wished.
 """
 
@@ -31,6 +33,9 @@ _LATE_S = 0.25  # a position older than the filter by more is not used
 _COAST_S = 0.5  # the longest step without samples that is integrated
 _ECHO_S = 0.3  # an echo older than this is not the present thrust
 _SAME = 1e-6  # collectives this near are one: a float's rounding
+_JUDGE = 0.05  # how quickly the growth of f follows the innovations, per sample
+_CALM = -0.06  # product of two vertical innovations over their variance: -0.15 in calm air, -0.05 to 0.06 in gusts
+_MEAN = 0.02  # weight of an innovation in their mean: what telemetry's inconsistency leaves is no gust
 _SCALE_S = 1.0  # memory of the scale between echoed and specific thrust
 
 
@@ -42,6 +47,7 @@ class Params:
     velocity_sigma_m_s: float = 0.03
     f_growth: float = 0.02
     f_growth_down: float = 0.02
+    f_growth_least: float = 0.1  # share of it that is left in calm air, as the innovations say; 1: it stays as it is
     adapt: float = 0.0  # weight of a new residual in R (0: R stays)
     anchor_s: float = 1.5  # time constant of the raw position's slow part (0: off)
     drag: float = 1.0  # share of the airframe file's drag taken as known
@@ -53,6 +59,8 @@ class Params:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise ConfigError(f"eskf.{name} must be a finite number > 0, got {value}")
+        if not 0.001 <= self.f_growth_least <= 1.0:
+            raise ConfigError(f"eskf.f_growth_least = {self.f_growth_least}: expected 0.001 to 1 (off)")
         if not 0.0 <= self.adapt <= 0.2:
             raise ConfigError(f"eskf.adapt = {self.adapt}: expected 0 (off) to 0.2")
         if not (self.anchor_s == 0.0 or 0.2 <= self.anchor_s <= 60.0):
@@ -61,9 +69,21 @@ class Params:
             raise ConfigError(f"eskf.drag = {self.drag}, thrust_lag_s = {self.thrust_lag_s}: expected 0 to 2 and at most 1 s")
 
 
+class Growth(NamedTuple):
+    """The share of the growth of f that the filter believes in, and what it is judged by: innovations of velocity."""
+
+    share: float
+    last: Vec3  # the newest, less their mean
+    mean: Vec3
+
+
+FULL = Growth(1.0, ZERO3, ZERO3)
+
+
 class Gains(NamedTuple):
     horizontal: KfGains
     vertical: KfGains
+    least: float
     adapt: float
     anchor_s: float
     drag_linear_1_s: Vec3
@@ -85,6 +105,7 @@ class State(NamedTuple):
 
     t_us: int
     axes: tuple[KfState, KfState, KfState] | None
+    growth: Growth
     q_wxyz: Quat
     omega_rad_s: Vec3
     thrust_m_s2: float  # specific thrust of the rotors now, lagged
@@ -111,6 +132,7 @@ def gains(params: Params, airframe: Airframe) -> Gains:
     return Gains(
         axis(params.f_growth),
         axis(params.f_growth_down),
+        params.f_growth_least,
         params.adapt,
         params.anchor_s,
         (k * linear[0], k * linear[1], k * linear[2]),
@@ -121,7 +143,7 @@ def gains(params: Params, airframe: Airframe) -> Gains:
 
 
 def init(gains: Gains) -> State:
-    return State(0, None, quat.IDENTITY, ZERO3, G_M_S2, math.nan, 0, math.nan, (), 0, 0, 0.0, ZERO3, 0)
+    return State(0, None, FULL, quat.IDENTITY, ZERO3, G_M_S2, math.nan, 0, math.nan, (), 0, 0, 0.0, ZERO3, 0)
 
 
 @kernel
@@ -145,41 +167,68 @@ def known_acceleration(g: Gains, q: Quat, thrust_m_s2: float, v: Vec3) -> Vec3:
 
 @kernel
 def advance(
-    g: Gains, axes: tuple[KfState, KfState, KfState], q: Quat, thrust_m_s2: float, dt_s: float
+    g: Gains, axes: tuple[KfState, KfState, KfState], growth: Growth, q: Quat, thrust_m_s2: float, dt_s: float
 ) -> tuple[KfState, KfState, KfState]:
     """All three axes over dt."""
     n, e, d = axes
     a = known_acceleration(g, q, thrust_m_s2, (n.x[1], e.x[1], d.x[1]))
-    return (
-        eskf.advance(g.horizontal, n, a[0], dt_s),
-        eskf.advance(g.horizontal, e, a[1], dt_s),
-        eskf.advance(g.vertical, d, a[2], dt_s),
-    )
+    level, vertical = _growing(g.horizontal, growth.share), _growing(g.vertical, growth.share)
+    return (eskf.advance(level, n, a[0], dt_s), eskf.advance(level, e, a[1], dt_s), eskf.advance(vertical, d, a[2], dt_s))
 
 
 @kernel
-def _axis(g: KfGains, adapt: float, s: KfState, p: float, v: float, a: float, age_s: float) -> KfState:
+def _growing(g: KfGains, share: float) -> KfGains:
+    return KfGains(g.dt_s, share * g.q, g.r_first, g.r_second, g.p0, g.delta)
+
+
+@kernel
+def _axis(g: KfGains, adapt: float, s: KfState, p: float, v: float, a: float, age_s: float) -> tuple[KfState, float, float]:
+    """(axis corrected, innovation of its velocity, variance that was expected of it)."""
     total = a + s.x[2]
     p += age_s * v + 0.5 * age_s * age_s * total  # the sample carried forward to the filter's time
     v += age_s * total
+    innovation, expected = v - s.x[1], s.p[3] + s.r[1]
     s = eskf.update(g, s, p, v)
     if adapt > 0.0:
         s = eskf.adapt(s, p, v, adapt)
-    return s
+    return s, innovation, expected
 
 
 @kernel
 def correct(
-    g: Gains, axes: tuple[KfState, KfState, KfState], p: Vec3, v: Vec3, q: Quat, thrust_m_s2: float, age_s: float
-) -> tuple[KfState, KfState, KfState]:
-    """All three axes with a sample that is age_s older than the filter."""
+    g: Gains,
+    axes: tuple[KfState, KfState, KfState],
+    growth: Growth,
+    p: Vec3,
+    v: Vec3,
+    q: Quat,
+    thrust_m_s2: float,
+    age_s: float,
+) -> tuple[tuple[KfState, KfState, KfState], Growth]:
+    """All three axes, and the growth of f, with a sample that is age_s older than the filter."""
     n, e, d = axes
     a = known_acceleration(g, q, thrust_m_s2, (n.x[1], e.x[1], d.x[1]))
-    return (
-        _axis(g.horizontal, g.adapt, n, p[0], v[0], a[0], age_s),
-        _axis(g.horizontal, g.adapt, e, p[1], v[1], a[1], age_s),
-        _axis(g.vertical, g.adapt, d, p[2], v[2], a[2], age_s),
-    )
+    n, e_n, s_n = _axis(g.horizontal, g.adapt, n, p[0], v[0], a[0], age_s)
+    e, e_e, s_e = _axis(g.horizontal, g.adapt, e, p[1], v[1], a[1], age_s)
+    d, e_d, s_d = _axis(g.vertical, g.adapt, d, p[2], v[2], a[2], age_s)
+    if g.least < 1.0:
+        growth = _judged(g.least, growth, (e_n, e_e, e_d), (s_n, s_e, s_d))
+    return (n, e, d), growth
+
+
+@kernel
+def _judged(least: float, growth: Growth, e: Vec3, expected: Vec3) -> Growth:
+    """Vertical innovations of changing sign: the filter follows mere noise, the air is calm. One like the other: it is not.
+
+    Gusts along the ground are slower: only strong ones show.
+    """
+    m = growth.mean
+    m = (m[0] + _MEAN * (e[0] - m[0]), m[1] + _MEAN * (e[1] - m[1]), m[2] + _MEAN * (e[2] - m[2]))
+    now = (e[0] - m[0], e[1] - m[1], e[2] - m[2])
+    last = growth.last
+    level = max(now[0] * last[0] / expected[0], now[1] * last[1] / expected[1])
+    drive = now[2] * last[2] / expected[2] - _CALM + max(0.0, level - 4.0)
+    return Growth(min(1.0, max(least, growth.share * math.exp(_JUDGE * min(10.0, drive)))), now, m)
 
 
 def observe(gains: Gains, state: State, sample: object) -> State:
@@ -207,7 +256,7 @@ def _to(gains: Gains, state: State, t_us: int) -> State:
     thrust = wanted + keep * (state.thrust_m_s2 - wanted)
     axes = state.axes
     if axes is not None:
-        axes = advance(gains, axes, state.q_wxyz, 0.5 * (state.thrust_m_s2 + thrust), dt_s)
+        axes = advance(gains, axes, state.growth, state.q_wxyz, 0.5 * (state.thrust_m_s2 + thrust), dt_s)
     return state._replace(t_us=t_us, axes=axes, thrust_m_s2=thrust)
 
 
@@ -246,7 +295,8 @@ def _position(gains: Gains, state: State, sample: Position) -> State:
     if not all(map(math.isfinite, v)):  # position alone: the velocity of the filter stands in and weighs nothing
         v = (n.x[1], e.x[1], d.x[1])
         n, e, d = _deaf(n), _deaf(e), _deaf(d)
-    n, e, d = axes = correct(gains, (n, e, d), p, v, state.q_wxyz, state.thrust_m_s2, age_s)
+    axes, growth = correct(gains, (n, e, d), state.growth, p, v, state.q_wxyz, state.thrust_m_s2, age_s)
+    n, e, d = axes
     if gains.adapt == 0.0:
         axes = (_hears(gains.horizontal, n), _hears(gains.horizontal, e), _hears(gains.vertical, d))
     offset = state.offset_m
@@ -259,7 +309,7 @@ def _position(gains: Gains, state: State, sample: Position) -> State:
             offset[1] + w * (p[1] - at[1] - offset[1]),
             offset[2] + w * (p[2] - at[2] - offset[2]),
         )
-    return state._replace(axes=axes, offset_m=offset, position_us=max(sample.t_us, state.position_us))
+    return state._replace(axes=axes, growth=growth, offset_m=offset, position_us=max(sample.t_us, state.position_us))
 
 
 def _deaf(axis: KfState) -> KfState:

@@ -31,7 +31,7 @@ def run(gains: Gains, events: record.Events) -> record.Observed:
 
 
 @kernel
-def _to(gains, axes, placed, q, thrust, wanted, now_us, t_us):
+def _to(gains, axes, growth, placed, q, thrust, wanted, now_us, t_us):
     """(axes, thrust, now) at t, if that is ahead."""
     dt_s = 1e-6 * (t_us - now_us)
     if dt_s <= 0.0:
@@ -41,7 +41,7 @@ def _to(gains, axes, placed, q, thrust, wanted, now_us, t_us):
     keep = math.exp(-dt_s / gains.thrust_lag_s) if gains.thrust_lag_s > 1e-4 else 0.0
     lagged = wanted + keep * (thrust - wanted)
     if placed:
-        axes = flight.advance(gains, axes, q, 0.5 * (thrust + lagged), dt_s)
+        axes = flight.advance(gains, axes, growth, q, 0.5 * (thrust + lagged), dt_s)
     return axes, lagged, t_us
 
 
@@ -57,7 +57,7 @@ def _hears(g, axis):
 
 @kernel
 def _run(gains, first, kinds, stamps, x, steps, out_p, out_v, out_f, low, high):
-    axes = first
+    axes, growth = first, flight.FULL
     now_us, position_us, command_us = 0, 0, 0
     placed = False
     thrust, command, before = _G_M_S2, _G_M_S2, _G_M_S2
@@ -70,7 +70,7 @@ def _run(gains, first, kinds, stamps, x, steps, out_p, out_v, out_f, low, high):
             if t_us > command_us:
                 before, command, command_us = command, x[i, 2], t_us
         elif kind == _ATTITUDE:
-            axes, thrust, now_us = _to(gains, axes, placed, q, thrust, wanted, now_us, t_us)
+            axes, thrust, now_us = _to(gains, axes, growth, placed, q, thrust, wanted, now_us, t_us)
             q = (x[i, 0], x[i, 1], x[i, 2], x[i, 3])
         elif kind == _POSITION:
             p, v = (x[i, 0], x[i, 1], x[i, 2]), (x[i, 3], x[i, 4], x[i, 5])
@@ -78,10 +78,11 @@ def _run(gains, first, kinds, stamps, x, steps, out_p, out_v, out_f, low, high):
                 axes = (_begun(first[0], p[0], v[0]), _begun(first[1], p[1], v[1]), _begun(first[2], p[2], v[2]))
                 now_us, position_us, placed = max(now_us, t_us), t_us, True
             else:
-                axes, thrust, now_us = _to(gains, axes, placed, q, thrust, wanted, now_us, t_us)
+                axes, thrust, now_us = _to(gains, axes, growth, placed, q, thrust, wanted, now_us, t_us)
                 age_s = 1e-6 * (now_us - t_us)
                 if age_s <= _LATE_S:
-                    n, e, d = flight.correct(gains, axes, p, v, q, thrust, age_s)
+                    axes, growth = flight.correct(gains, axes, growth, p, v, q, thrust, age_s)
+                    n, e, d = axes
                     if gains.adapt == 0.0:
                         n, e, d = _hears(gains.horizontal, n), _hears(gains.horizontal, e), _hears(gains.vertical, d)
                     axes = (n, e, d)

@@ -8,6 +8,7 @@ import pytest
 from mavquad import airframe, quat
 from mavquad.errors import ConfigError
 from mavquad.estimate import extended_state_flight as flight
+from mavquad.setpoint.attitude import attitude, thrust_vector
 from mavquad.signals import NAN3, ZERO3, Applied, Attitude, Imu, Position, Target
 
 G = 9.80665
@@ -97,6 +98,33 @@ def test_an_echo_says_which_of_our_setpoints_acts():
     assert told > 50
     stamps = [s.acts_us for s in state.sent]
     assert stamps == sorted(stamps)
+
+
+def _share(gust_m_s2, jolt_m_s2=0.0, least=0.1, seed=3):
+    """The share of the growth after a minute of hover in vertical gusts (memory 0.35 s), with one jolt to the north at its end."""
+    gains, rng = flight.gains(flight.Params(f_growth_least=least), FRAME), np.random.default_rng(seed)
+    state, p, v, f = flight.init(gains), np.zeros(3), np.zeros(3), np.zeros(3)
+    keep = math.exp(-0.02 / 0.35)
+    for k in range(1, 3000):
+        f[2] = keep * f[2] + gust_m_s2 * math.sqrt(1.0 - keep * keep) * rng.standard_normal()
+        f[0] = jolt_m_s2 if k > 2980 else 0.0
+        a = f - 2.0 * v - 1.0 * p  # held about a point; what holds it is thrust, known to the filter
+        q, thrust = attitude(thrust_vector(tuple(a - f), 1.0, 1.0, 20.0), 0.0)
+        state = flight.observe(gains, state, Attitude(20_000 * k, q, ZERO3))
+        state, _ = flight.step(gains, state, Applied(20_000 * k, q, thrust, NAN3, 0.0), 20_000 * k)
+        p, v = p + 0.02 * v + 2e-4 * a, v + 0.02 * a
+        told = p + 0.02 * rng.standard_normal(3), v + 0.03 * rng.standard_normal(3)
+        state = flight.observe(gains, state, Position(20_000 * k + 19_000, tuple(told[0]), tuple(told[1])))
+    return state.growth.share
+
+
+def test_in_calm_air_the_filter_follows_less_of_the_noise():
+    assert _share(0.0) < 0.4
+    assert _share(1.2) > 0.8
+    assert _share(0.0, jolt_m_s2=6.0) > 2.0 * _share(0.0)  # a gust along the ground wakes it within 0.4 s
+    assert _share(0.0, least=1.0) == 1.0  # off
+    with pytest.raises(ConfigError, match="f_growth_least"):
+        flight.Params(f_growth_least=0.0)
 
 
 def test_an_estimate_from_an_older_sample_has_longer_to_wait_for_its_command():
