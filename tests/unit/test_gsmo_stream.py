@@ -184,3 +184,10 @@ def test_a_lost_observer_starts_again_with_the_sample_that_showed_it():
             _, w, health = gsmo.read(gains, state, 200 * k)
             assert math.hypot(*w) <= gsmo_core.MAX_RATE_RAD_S
         assert health.counts.lost > 0
+
+
+def test_rates_are_settled_after_a_second_of_samples_and_a_lone_observer_has_no_member():
+    for n, settled in ((90, False), (100, False), (103, True), (140, True)):
+        _, state, t_us = sampled("relay", n)
+        health = gsmo.health(state, t_us)
+        assert (health.settled, health.member) == (settled, -1), n
