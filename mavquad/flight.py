@@ -41,6 +41,7 @@ class Flight:
     publish_us: int
     q_wxyz: Quat  # newest attitude
     position: Position | None
+    told: tuple[Vec3, Vec3] | None  # position and velocity as last sent
     position_age: position_age.State  # how far behind its stamp it is
     offset_m: Vec3  # subtracted from every position: the sum of the autopilot's own resets
     origin_m: Vec3  # where the vehicle was armed
@@ -122,6 +123,7 @@ def forget(plan: Plan, f: Flight) -> None:
     f.stamps, f.arrivals, f.behind = {}, {}, 0
     f.newest_arrival_us = f.pace_us = 0
     f.q_wxyz, f.position_age = (1.0, 0.0, 0.0, 0.0), position_age.START
+    f.told = None
     f.position, f.offset_m, f.origin_m, f.estimate = None, ZERO3, ZERO3, None
     f.anchor_p_m, f.anchor_yaw_rad = ZERO3, 0.0
     f.delay_echo_s, f.setpoints = math.nan, ()

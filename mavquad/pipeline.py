@@ -176,6 +176,8 @@ def _bounds(plan: Plan, f: Flight, p: Vec3) -> None:
         why = f"fence of {safety.fence_m:g} m crossed"
     elif f.origin_m[2] - p[2] > safety.ceiling_m:
         why = f"ceiling of {safety.ceiling_m:g} m crossed"
+    elif f.delay_s > safety.delay_s:
+        why = f"delay of {1e3 * f.delay_s:.0f} ms cannot be flown"
     elif 0.0 <= f.battery_percent < safety.battery_percent:
         why = f"battery at {f.battery_percent:.0f} %"
     if why:

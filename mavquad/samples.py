@@ -45,10 +45,16 @@ def take(plan: Plan, f: Flight, name: str, frame: Frame) -> None:
     elif t_us <= f.stamps.get(name, -1):
         outbox.count(f, f"{name} late or twice")
         return
+    kind = type(sample)
+    if kind is Position:
+        told = (sample.p_ned_m, sample.v_ned_m_s)
+        if told == f.told and any(sample.v_ned_m_s):  # it moves and never gets anywhere: no news, however fresh its stamp
+            outbox.count(f, "position frozen")
+            return
+        f.told = told
     f.stamps[name], f.arrivals[name] = t_us, f.arrival_us
     if t_us > f.now_us:
         f.now_us, f.newest_arrival_us = t_us, f.arrival_us
-    kind = type(sample)
     if kind is Position:
         f.position_age = position_age.hear(f.position_age, t_us, sample.v_ned_m_s)
         p, v = position_age.carried(f.position_age, sample.p_ned_m, sample.v_ned_m_s)

@@ -42,6 +42,7 @@ class Safety(config.Section, frozen=True):
     level_s: float = 0.75  # ... level, at hover thrust
     release_s: float = 1.5  # ... stop sending, so that the autopilot's own failsafe acts
     late_s: float = 0.4  # our own lateness, for half a second: release
+    delay_s: float = 0.5  # measured to the autopilot and back: land, by its own loops
     fence_m: float = 500.0  # horizontal, from where the vehicle was armed
     ceiling_m: float = 120.0
     battery_percent: float = 15.0  # land below
