@@ -22,7 +22,8 @@ from mavquad import linalg, quat
 from mavquad.airframe import Airframe, ModelBounds
 from mavquad.compensate import active_model
 from mavquad.errors import ConfigError
-from mavquad.estimate import asmf, command_line, quad_error
+from mavquad.estimate import command_line, quad_error
+from mavquad.jit import kernel
 from mavquad.signals import NAN3, ZERO3, Applied, Attitude, Command, Demand, Estimate, Imu, Position, Target, Vec3
 
 G_M_S2 = 9.80665
@@ -92,6 +93,8 @@ class State(NamedTuple):
     imu_count: int
     imu_us: int  # sum of the stamps
     authority: float
+    cuts: quad_error.Cuts | None  # published bounds of f
+    left: float  # authority by the filter's own judgement
     velocity_us: int  # of the newest velocity taken
     f_ned_m_s2: Vec3  # as cancelled
     given_back_m_s2: Vec3
@@ -133,7 +136,7 @@ def init(gains: Gains) -> State:
     return State(
         None,
         command_line.init(np.array([0.0, 0.0, G_M_S2])),
-        0, False, None, None, None, -(1 << 62), ZERO3, 0, 0, 0.0, 0, ZERO3, ZERO3,
+        0, False, None, None, None, -(1 << 62), ZERO3, 0, 0, 0.0, None, 0.0, 0, ZERO3, ZERO3,
     )  # fmt: skip
 
 
@@ -182,9 +185,8 @@ def step(
     command = _acting(gains, state, applied, t_us, dt_s)
     if begin:
         attitude = quat.to_euler(state.attitude.q_wxyz)
-        state = state._replace(
-            model=quad_error.init(gains.model, state.velocity.v_ned_m_s, attitude, command[2]), authority=0.0, velocity_us=t_us
-        )
+        model = quad_error.init(gains.model, state.velocity.v_ned_m_s, attitude, command[2])
+        state = state._replace(model=model, authority=0.0, velocity_us=t_us, cuts=quad_error.bounds(model), left=1.0)
     else:
         state = _estimate(gains, state, command, t_us, dt_s)
     state = state._replace(t_us=t_us, active=active, imu_sum_m_s2=ZERO3, imu_count=0, imu_us=0)
@@ -195,10 +197,10 @@ def step(
 
 def published(state: State) -> tuple[float, ...]:
     """What is shown, named by PUBLISHED. NaN before there is an estimate."""
-    if state.model is None:
+    if state.model is None or state.cuts is None:
         return (math.nan,) * 12 + (0.0,) * 3 + (state.authority, *state.given_back_m_s2, math.nan)
     inner = state.model.filter
-    n, e, d = (quad_error.bounds_f(state.model, axis) for axis in range(3))
+    n, e, d = state.cuts
     x = inner.x
     return (
         float(x[3]), float(x[4]), float(x[5]), n.low, e.low, d.low, n.high, e.high, d.high, float(x[8]), float(x[9]),
@@ -264,10 +266,9 @@ def _estimate(gains: Gains, state: State, command: Vec3, t_us: int, dt_s: float)
         max(0.0, 1e-6 * (t_us - velocity.t_us)),
         max(0.0, 1e-6 * (t_us - accel_us)),
     )
-    return state._replace(
-        model=quad_error.step(gains.model, model, command, measured, dt_s, t_us),
-        velocity_us=velocity.t_us if new_velocity else state.velocity_us,
-    )
+    model, cuts, left = quad_error.judged_step(gains.model, model, command, measured, dt_s, t_us)
+    velocity_us = velocity.t_us if new_velocity else state.velocity_us
+    return state._replace(model=model, cuts=cuts, left=left, velocity_us=velocity_us)
 
 
 def _correct(gains: Gains, state: State, nominal: Command, t_us: int, dt_s: float) -> tuple[State, Command]:
@@ -275,27 +276,37 @@ def _correct(gains: Gains, state: State, nominal: Command, t_us: int, dt_s: floa
     assert model is not None
     x = model.filter.x
     f: Vec3 = (float(x[3]), float(x[4]), float(x[5]))
-    cuts = [quad_error.bounds_f(model, axis) for axis in range(3)]
+    cuts = state.cuts
+    assert cuts is not None
     if gains.mode == "minmax":
         f = (0.5 * (cuts[0].low + cuts[0].high), 0.5 * (cuts[1].low + cuts[1].high), 0.5 * (cuts[2].low + cuts[2].high))
     stale_s = 1e-6 * (t_us - state.velocity_us) - STALE_S
     if stale_s > 0.0:
         f = linalg.scale(math.exp(-dt_s / STALE_TAU_S), state.f_ned_m_s2)
-    wanted = gains.authority * asmf.authority(model.filter, t_us)
-    wanted *= active_model.gain_of_bounds(gains.correction, _half_width(model))
-    authority = active_model.ramped(gains.correction, state.authority, wanted, dt_s)
     own = nominal.f_cancelled_m_s2 if _finite(nominal.f_cancelled_m_s2) else ZERO3
-    believed = tuple(
-        linalg.clip(v, cut.low - WOUND_UP_M_S2, cut.high + WOUND_UP_M_S2) for v, cut in zip(own, cuts, strict=True)
-    )
-    a_wanted = tuple(a + o - (1.0 - authority) * b for a, o, b in zip(nominal.a_ned_m_s2, own, believed, strict=True))
-    f_attitude = (float(x[8]), float(x[9]))
-    a = active_model.correct(gains.correction, a_wanted, nominal.yaw_rad, f, f_attitude, authority)
-    given_back = tuple(o - (1.0 - authority) * b for o, b in zip(own, believed, strict=True))
-    cancelled = tuple(authority * v + (1.0 - authority) * b for v, b in zip(f, believed, strict=True))
+    authority, a, given_back, cancelled = _share(
+        gains.correction, state.authority, gains.authority * state.left, _half_width(model), dt_s,
+        nominal.a_ned_m_s2, nominal.yaw_rad, own, cuts, f, (float(x[8]), float(x[9])),
+    )  # fmt: skip
     state = state._replace(authority=authority, f_ned_m_s2=f, given_back_m_s2=given_back)
     return state, nominal._replace(a_ned_m_s2=a, f_cancelled_m_s2=cancelled)
 
 
+@kernel
+def _share(correction, before, wanted, half_width, dt_s, nominal, yaw_rad, own, cuts, f, f_attitude):
+    """(authority, acceleration to command, given back, cancelled): the controller's own estimate takes what authority leaves."""
+    wanted *= active_model.gain_of_bounds(correction, half_width)
+    authority = active_model.ramped(correction, before, wanted, dt_s)
+    rest, most = 1.0 - authority, WOUND_UP_M_S2
+    believed = (
+        rest * linalg.clip(own[0], cuts[0].low - most, cuts[0].high + most),
+        rest * linalg.clip(own[1], cuts[1].low - most, cuts[1].high + most),
+        rest * linalg.clip(own[2], cuts[2].low - most, cuts[2].high + most),
+    )
+    given_back = linalg.sub(own, believed)
+    a = active_model.correct(correction, linalg.add(nominal, given_back), yaw_rad, f, f_attitude, authority)
+    return authority, a, given_back, linalg.axpy(authority, f, believed)
+
+
 def _finite(values: tuple[float, ...]) -> bool:
-    return all(math.isfinite(v) for v in values)
+    return math.isfinite(sum(values))

@@ -6,7 +6,7 @@ from typing import Any
 from mavquad import control_step, lifecycle, outbox, position_age, slowing, wire
 from mavquad.errors import LinkError
 from mavquad.flight import Flight, forget
-from mavquad.lifecycle import ENGAGED, OBSERVING, STREAMING
+from mavquad.lifecycle import ENGAGED, OBSERVING, RELEASED, STREAMING
 from mavquad.link import signals as decode
 from mavquad.plan import Plan
 from mavquad.signals import Attitude, Imu, Position, Target
@@ -56,7 +56,8 @@ def take(plan: Plan, f: Flight, name: str, frame: Frame) -> None:
     if t_us > f.now_us:
         f.now_us, f.newest_arrival_us = t_us, f.arrival_us
     if kind is Position:
-        f.position_age = position_age.hear(f.position_age, t_us, sample.v_ned_m_s)
+        if f.life.state != RELEASED:  # a touch-down would spoil what is known
+            f.position_age = position_age.hear(f.position_age, t_us, sample.v_ned_m_s)
         p, v = position_age.carried(f.position_age, sample.p_ned_m, sample.v_ned_m_s)
         sample = _continuous(plan, f, sample._replace(p_ned_m=p, v_ned_m_s=v))
     elif kind is Imu:

@@ -16,7 +16,7 @@ class Params:
     wc_rad_s: float = 0.0
     damping: float = 1.0
     drag_feed_forward: float = 1.0
-    accel_max_m_s2: float = 6.0
+    accel_max_m_s2: float = 8.0
 
 
 def gains(params: Params, airframe: Airframe) -> Gains:

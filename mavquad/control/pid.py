@@ -24,7 +24,7 @@ class Params:
     damping: float = 1.0
     integral: float = 0.35  # ki = integral wc^3 (0: a PD)
     drag_feed_forward: float = 1.0  # share of the airframe file's drag along the path that is fed forward
-    accel_max_m_s2: float = 6.0
+    accel_max_m_s2: float = 8.0  # 39 degrees, below the gate's 40: less is lost upwind
     integral_max_m_s2: float = 4.0
 
     def __post_init__(self) -> None:
