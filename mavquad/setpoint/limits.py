@@ -121,7 +121,7 @@ def apply_kernel(
 def sticks(last: Sticks | None, wanted: Sticks, dt_s: float) -> tuple[Sticks, int]:
     """A helicopter's sticks that may be sent dt after `last` (None: none yet): finite, -1..1, STICK_SLEW_PER_S; and the bits."""
     bits, out = 0, []
-    most = STICK_SLEW_PER_S * (min(dt_s, 0.1) if dt_s > 0.0 else 0.0)  # also NaN
+    most = STICK_SLEW_PER_S * dt_s if dt_s > 0.0 else 0.0  # also NaN; a tenth of a second is the whole travel
     for i, value in enumerate(wanted):
         before = last[i] if last is not None else 0.0
         if not math.isfinite(value):
