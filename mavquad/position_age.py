@@ -20,6 +20,7 @@ SMOOTH_S = 0.02  # of the acceleration
 WASH_S = 1.5
 MEMORY_S = 120.0
 NOISE_M_S = 0.03  # of a velocity, one sigma
+SPIKE_M_S = 0.7  # no age explains more
 PRIOR_S = 0.03  # of the age
 LEAST_S, MOST_S = 0.006, 0.15
 SURE_S = 0.004  # an age told less surely than this is not used
@@ -79,9 +80,10 @@ def hear(state: State, t_us: int, v_ned_m_s: Vec3) -> State:
     felt = linalg.axpy(1e-6 * (t_us - state.imu_us), raw, state.v_ned_m_s)
     e, e_out = _wash(state.e, linalg.sub(v_ned_m_s, felt), dt_s)
     b, a_out = _wash(state.a, a, dt_s)
-    keep = math.exp(-dt_s / MEMORY_S)
-    aa = keep * state.aa + linalg.dot(a_out, a_out)
-    ae = keep * state.ae + linalg.dot(a_out, e_out)
+    aa, ae = state.aa, state.ae
+    if linalg.norm(e_out) < SPIKE_M_S:
+        keep = math.exp(-dt_s / MEMORY_S)
+        aa, ae = keep * aa + linalg.dot(a_out, a_out), keep * ae + linalg.dot(a_out, e_out)
     ridge = (NOISE_M_S / PRIOR_S) ** 2
     found = -ae / (aa + ridge)
     sure = NOISE_M_S / math.sqrt(aa + ridge) < SURE_S

@@ -127,13 +127,14 @@ class Fault(config.Section, frozen=True):
     nan, freeze,  gyro, accel, imu, attitude, position, mocap   -
       dropout
     bias          gyro [rad/s], accel [m/s^2], position [m]     three numbers
+    spikes        gyro, accel, position (its velocity [m/s])    three numbers: their size, in 2 % of the samples
     motor         -                                             motor (1..4) and effectiveness 0..1
     push          -                                             force_n (world axes) and torque_nm (body axes)
     ekf_reset     -                                             value = the jump of the position, m
     restart       -                                             - (the autopilot boots again; motors stop)
     """
 
-    kind: Literal["nan", "freeze", "dropout", "bias", "motor", "push", "ekf_reset", "restart"]
+    kind: Literal["nan", "freeze", "dropout", "spikes", "bias", "motor", "push", "ekf_reset", "restart"]
     t_s: float
     duration_s: float = 0.0
     sensor: Literal["gyro", "accel", "imu", "attitude", "position", "mocap"] | None = None
@@ -146,13 +147,13 @@ class Fault(config.Section, frozen=True):
     def __post_init__(self) -> None:
         _bounds("faults.t_s", self.t_s, 0.0, 1e6, "s")
         _bounds("faults.duration_s", self.duration_s, 0.0, 1e6, "s")
-        if self.kind in ("nan", "freeze", "dropout", "bias") and self.sensor is None:
+        if self.kind in ("nan", "freeze", "dropout", "spikes", "bias") and self.sensor is None:
             raise ConfigError(
                 f'faults: kind = "{self.kind}" needs sensor = "gyro", "accel", "imu", "attitude", "position" or "mocap"'
             )
-        if self.kind == "bias" and self.sensor not in ("gyro", "accel", "position"):
+        if self.kind in ("bias", "spikes") and self.sensor not in ("gyro", "accel", "position"):
             raise ConfigError(
-                f'faults: a bias of {self.sensor!r} is not modelled; expected sensor = "gyro", "accel" or "position"'
+                f'faults: {self.kind} of {self.sensor!r} is not modelled; expected sensor = "gyro", "accel" or "position"'
             )
         if self.kind == "motor" and not (1 <= self.motor <= 4 and 0.0 <= self.effectiveness <= 1.5):
             raise ConfigError(

@@ -1,11 +1,13 @@
 """What goes wrong on request, at its instant of vehicle time: sensors, rotors, pushes, jumps of the estimator, a restart.
 
-NaN, freeze and dropout are faults of what is *sent* (the autopilot itself has a second sensor); a bias is in the sensor and so in
-everything behind it.
+NaN, freeze, dropout and spikes are faults of what is *sent* (the autopilot itself has a second sensor); a bias is in the sensor and so
+in everything behind it.
 """
 
 import math
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from sitl.config import Fault
 from sitl.links import NEVER
@@ -14,6 +16,8 @@ from sitl.telemetry import SENSOR_OF
 if TYPE_CHECKING:
     from sitl.simulation import Simulation
 
+SPIKES = 0.02  # of the samples while the fault is at work
+_SPIKED = {"gyro": ("gyro_rad_s", "rates_rad_s"), "accel": ("accel_m_s2",), "position": ("nav_v_ned_m_s",)}
 _BIASES = {"gyro": "gyro_bias", "accel": "accel_bias", "position": "position_bias"}
 
 
@@ -30,7 +34,9 @@ class Faults:
                 self._events.append((start_us + round(1e6 * fault.duration_s), False, fault))
         self._events.sort(key=lambda event: event[0])
         self.due_us = self._events[0][0] if self._events else NEVER
-        self._active: dict[str, str] = {}  # sensor -> nan, freeze or dropout
+        self._active: dict[str, str] = {}  # sensor -> nan, freeze, dropout or spikes
+        self._spikes: dict[str, tuple[float, ...]] = {}
+        self._rng = np.random.default_rng([sim.config.seed, 96])
         self._frozen: dict[tuple[str, str], list[float]] = {}
 
     def apply(self, t_us: int) -> None:
@@ -53,6 +59,9 @@ class Faults:
             return [math.nan] * len(values)
         if kind == "freeze":
             return self._frozen.setdefault((sensor, view), values)
+        if kind == "spikes" and view in _SPIKED[sensor] and self._rng.random() < SPIKES:
+            signs = self._rng.choice((-1.0, 1.0), 3).tolist()
+            return [x + sign * size for x, sign, size in zip(values, signs, self._spikes[sensor], strict=True)]
         return values
 
     def drops(self, message: str) -> bool:
@@ -86,5 +95,5 @@ class Faults:
             for sensor in ("gyro", "accel") if fault.sensor == "imu" else (fault.sensor or "",):
                 self._active.pop(sensor, None)
                 if begins:
-                    self._active[sensor] = fault.kind
+                    self._active[sensor], self._spikes[sensor] = fault.kind, fault.value
             self._frozen.clear()

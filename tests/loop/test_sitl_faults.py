@@ -52,6 +52,21 @@ def test_nan_freeze_and_dropout_are_what_is_sent(sensor, message, fields):
     assert c.counts[message] > before
 
 
+def test_spikes_are_in_some_of_the_velocities_sent_and_in_nothing_that_is_flown():
+    c = with_fault('kind="spikes", sensor="position", t_s=1.0, value=[2.5, 2.5, 2.5]')
+    c.run(1.5)
+    seen = []
+    for _ in range(500):
+        c.run(0.02)
+        m = c.last["LOCAL_POSITION_NED"]
+        assert abs(m.x) < 0.2  # positions have none
+        seen.append(max(abs(m.vx), abs(m.vy), abs(m.vz)))
+    spikes = sum(v > 2.0 for v in seen)
+    assert 2 <= spikes <= 30
+    assert all(v < 0.3 or 2.0 < v < 3.0 for v in seen)
+    assert max(abs(v) for v in c.sim.vehicle.state["nav_v_ned_m_s"]) < 0.3
+
+
 def test_a_sick_sensor_shows_in_the_health_bits():
     c = with_fault('kind="nan", sensor="imu", t_s=1.0')
     c.run(0.9)
@@ -151,7 +166,8 @@ def test_a_flight_goes_on_through_a_gust_and_a_dropout_together():
     ("text", "said"),
     [
         ('kind="motor", motor=5, t_s=1.0', "motor = 5"),
-        ('kind="bias", sensor="attitude", t_s=1.0', "a bias of 'attitude' is not modelled"),
+        ('kind="bias", sensor="attitude", t_s=1.0', "bias of 'attitude' is not modelled"),
+        ('kind="spikes", sensor="attitude", t_s=1.0', "spikes of 'attitude' is not modelled"),
         ('kind="explode", t_s=1.0', "kind = 'explode'"),
     ],
 )
