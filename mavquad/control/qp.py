@@ -13,7 +13,8 @@ from scipy import sparse
 
 SOLVED, INACCURATE = 1, 2
 REFUSED = -1  # data that OSQP must not see: not finite, or a lower bound above its upper one
-EPS, MAX_ITER = 1e-4, 400
+ALPHA = 1.6  # over-relaxation
+EPS, MAX_ITER = 1e-4, 600
 
 
 class Problem(NamedTuple):
@@ -21,6 +22,7 @@ class Problem(NamedTuple):
 
     solver: Any
     rows: np.ndarray  # A, dense (m, n)
+    weights: np.ndarray  # (m,): the solver sees w A, w l, w u
 
 
 class Start(NamedTuple):
@@ -42,18 +44,30 @@ class QpResult(NamedTuple):
         return self.status in (SOLVED, INACCURATE)
 
 
-def problem(p: np.ndarray, rows: np.ndarray, *, rho: float, eps: float = EPS, max_iter: int = MAX_ITER) -> Problem:
-    """Factorise once. p (n,n) positive definite, rows (m,n)."""
+def problem(
+    p: np.ndarray,
+    rows: np.ndarray,
+    *,
+    rho: float,
+    weights: np.ndarray | None = None,
+    alpha: float = ALPHA,
+    eps: float = EPS,
+    max_iter: int = MAX_ITER,
+) -> Problem:
+    """Factorise once. p (n,n) positive definite, rows (m,n). A weight w of a row gives it the step rho w^2; None: 1 each."""
     n, m = p.shape[0], rows.shape[0]
+    weights = np.ones(m) if weights is None else weights
     solver = osqp.OSQP()
     solver.setup(
         sparse.csc_matrix(np.triu(p)),
         np.zeros(n),
-        sparse.csc_matrix(rows),
+        sparse.csc_matrix(weights[:, None] * rows),
         -np.ones(m),
         np.ones(m),
         rho=rho,
         adaptive_rho=False,
+        scaling=0,  # by the weights, at design time: OSQP's own would undo them
+        alpha=alpha,
         eps_abs=eps,
         eps_rel=eps,
         max_iter=max_iter,
@@ -62,7 +76,7 @@ def problem(p: np.ndarray, rows: np.ndarray, *, rho: float, eps: float = EPS, ma
         polishing=False,
         verbose=False,
     )
-    return Problem(solver, rows)
+    return Problem(solver, rows, weights)
 
 
 def cold(problem: Problem) -> Start:
@@ -75,14 +89,15 @@ def solve(problem: Problem, q: np.ndarray, lower: np.ndarray, upper: np.ndarray,
     if not (np.isfinite(q).all() and np.isfinite(lower).all() and np.isfinite(upper).all() and (lower <= upper).all()):
         return _failed(problem, REFUSED, 0, 0.0)
     # OSQP keeps old bounds where l > u, and a NaN for ever: both are kept from it
-    problem.solver.update(q=q, l=lower, u=upper)
-    problem.solver.warm_start(x=start.x, y=start.y)
+    w = problem.weights
+    problem.solver.update(q=q, l=w * lower, u=w * upper)
+    problem.solver.warm_start(x=start.x, y=start.y / w)
     found = problem.solver.solve(raise_error=False)
     info = found.info
     status, iterations, seconds = int(info.status_val), int(info.iter), float(info.solve_time)
     if status not in (SOLVED, INACCURATE) or not (np.isfinite(found.x).all() and np.isfinite(found.y).all()):
         return _failed(problem, status, iterations, seconds)
-    return QpResult(np.array(found.x), np.array(found.y), status, iterations, seconds)
+    return QpResult(np.array(found.x), w * found.y, status, iterations, seconds)
 
 
 def _failed(problem: Problem, status: int, iterations: int, seconds: float) -> QpResult:
