@@ -146,10 +146,11 @@ def split(data: bytes) -> tuple[list[Frame], int, bytes]:
     """Whole frames in `data`, the number of bytes refused, and the rest that may be the beginning of a frame.
 
     A known message with a wrong CRC is refused byte by byte, so that a frame behind junk is still found. One of an unknown
-    id cannot be checked: it is passed on where another frame or nothing follows it (`decode` will say that it is unknown).
+    id cannot be checked: it is passed on where it begins at once behind a frame and another or nothing follows it (`decode` will
+    say that it is unknown); in the remains of a spoiled frame it would swallow what comes next.
     """
     frames: list[Frame] = []
-    refused = at = 0
+    refused = at = clean = 0  # clean: where the last frame ended
     size = len(data)
     while at < size:
         stx = data[at]
@@ -179,14 +180,14 @@ def split(data: bytes) -> tuple[list[Frame], int, bytes]:
             break
         extra = _EXTRA.get(msgid)
         if (
-            data[end : end + 1] not in _BEGINS
+            at != clean or data[end : end + 1] not in _BEGINS
             if extra is None
             else data[crc_at] | data[crc_at + 1] << 8 != mcrf4xx(data[at + 1 : crc_at] + extra)
         ):
             at, refused = at + 1, refused + 1
             continue
         frames.append(_new(Frame, (data[at:end], msgid, system, component, seq)))
-        at = end
+        at = clean = end
     return frames, refused, data[at:]
 
 
@@ -201,8 +202,8 @@ def datagram(data: bytes) -> tuple[list[Frame], int]:
     """
     frames, refused, rest = split(data)
     while rest:
-        more, junk, rest = split(rest[1:])
-        frames, refused = frames + more, refused + 1 + junk
+        more, junk, rest = split(b"\0" + rest[1:])
+        frames, refused = frames + more, refused + junk
     return frames, refused
 
 

@@ -134,3 +134,31 @@ def test_a_spoiled_length_hides_no_frame_behind_it():
             assert frames[-1].raw == second
     assert wire.datagram(first + second[:-3]) == (wire.split(first)[0], len(second) - 3)
     assert wire.datagram(b"\xfd" * 40 + second)[0][-1].raw == second
+
+
+def test_what_looks_like_an_unknown_message_inside_a_spoiled_frame_swallows_nothing():
+    """Payload bytes that read as the head of a frame of an unknown id, which would end exactly where the datagram does."""
+    barrier = wire.encode("TIMESYNC", (0, 123_000, 0, 0), seq=2, system=1, component=1)
+    for behind in range(256):
+        data = (0xFD, behind, 0, 0, 0, 9, 9, 0xFF, 0xFF, 0x7F)
+        first = wire.encode("DATA16", (1, 16, (*data, *(7,) * 6)), seq=1, system=1, component=1)
+        spoiled = first[:7] + bytes([first[7] ^ 1]) + first[8:]  # another id of ours: its CRC is wrong
+        frames, _ = wire.datagram(spoiled + barrier)
+        assert [f.raw for f in frames][-1:] == [barrier], behind
+
+
+_FRAMES = [
+    wire.encode("ATTITUDE_QUATERNION", (1000, 0.7, 0.1, -0.7, 0.1, 0.1, 0.2, 0.3, (0.0,) * 4), seq=3, system=1, component=1),
+    wire.encode("HIGHRES_IMU", (2000, 0.1, 0.2, -9.8, *(0.3,) * 10, 63, 0), seq=4, system=1, component=1),
+    wire.encode("STATUSTEXT", (6, "waiting for local position", 0, 0), seq=5, system=1, component=1),
+    wire.encode("TIMESYNC", (0, 8_000_000, 0, 0), seq=6, system=1, component=1),
+]
+
+
+@given(which=st.integers(0, 2), share=st.floats(0.0, 1.0, exclude_max=True), change=st.integers(1, 255))
+def test_one_spoiled_byte_costs_one_frame(which, share, change):
+    raw = bytearray(_FRAMES[which])
+    raw[int(share * len(raw))] ^= change
+    frames, _ = wire.datagram(b"".join([*_FRAMES[:which], bytes(raw), *_FRAMES[which + 1 :]]))
+    found = [f.raw for f in frames]
+    assert [raw for raw in found if raw in _FRAMES] == [raw for i, raw in enumerate(_FRAMES) if i != which]
