@@ -2,7 +2,7 @@
 
 Here the correction is not an acceleration added to a command: surge and sway can only be cancelled by tilting, and separate loops for
 attitude and velocity stay metres off (design note of the ASMF, section 7). From the path and the model error f follow the states and
-sticks that fly it (`compensate/helicopter.py`), and the sticks go out (SET_ACTUATOR_CONTROL_TARGET, group 0) at 50 Hz. The nominal
+sticks that fly it (`compensate/helicopter.py`), and the sticks go out (SET_ACTUATOR_CONTROL_TARGET, group 0), new ones 50 times a second. The nominal
 controller's command flies, through the autopilot's own inner loop, until the filter has settled and whenever authority is taken away.
 
 Sticks as applied come back in ACTUATOR_CONTROL_TARGET; each value is taken to act until its stamp. What has no echo yet is what was
@@ -29,7 +29,7 @@ from mavquad.identify import models
 from mavquad.signals import NO_STICKS, ZERO3, Applied, Attitude, Command, Controls, Demand, Estimate, Position, Sticks
 
 TICK_US = 20_000
-CONTROL_HZ = 50.0
+SLACK_US = 2_000  # a tick is due this much early: stamps are whole milliseconds
 GAP_S = 0.5  # a longer silence, or a clock that goes back: begin again
 READY_S = 1.0  # of filtering before our sticks fly
 FRESH_S = 0.25  # older velocities: the nominal command flies
@@ -115,11 +115,6 @@ def gains(params: Params, airframe: Airframe) -> Gains:
     )
 
 
-def control_hz(gains: Gains) -> float:
-    """The filter's own tick paces the flight."""
-    return CONTROL_HZ
-
-
 def init(gains: Gains) -> State:
     """Nothing heard, nothing sent."""
     line = command_line.init(np.zeros(4))
@@ -164,7 +159,7 @@ def step(
         return state._replace(model=None, t_us=t_us, sticks=NO_STICKS, authority=0.0, shown=_UNKNOWN), nominal
     if state.model is None or not 0.0 <= 1e-6 * (t_us - state.filter_us) <= GAP_S:
         state = _begin(gains, state, attitude, velocity, t_us)
-    ticks = (t_us - state.filter_us + TICK_US // 2) // TICK_US
+    ticks = (t_us - state.filter_us + SLACK_US) // TICK_US
     if ticks == 0 and state.t_us > 0:
         return state, nominal._replace(sticks=_wire(state.sticks))
     delay_s = _delay_s(gains, applied)

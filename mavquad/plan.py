@@ -117,9 +117,6 @@ def build(settings: Companion, airframe: Airframe | None = None) -> Plan:
     compensator = (
         stage("compensator", settings.compensator, correcting, tune, airframe) if settings.compensator != "none" else None
     )
-    control_hz = settings.control_hz
-    if compensator is not None and hasattr(compensator.module, "control_hz"):
-        control_hz = min(control_hz, compensator.module.control_hz(compensator.gains))
     estimator_stage = stage("estimator", estimator, ESTIMATORS, tune, airframe)
     controller_stage = stage(
         "controller", settings.controller, {settings.controller: module}, _with_loop(settings, module), airframe
@@ -134,7 +131,7 @@ def build(settings: Companion, airframe: Airframe | None = None) -> Plan:
         controller_stage,
         compensator,
         observers,
-        round(1e6 / control_hz),
+        round(1e6 / settings.control_hz),
         {wire.ID["HIGHRES_IMU"]: "HIGHRES_IMU", **samples},
         wire.ID["HIGHRES_IMU"] not in samples,
         publish.trace_names(tuple(s.label for s in observers), compensator.module if compensator else None),

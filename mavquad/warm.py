@@ -36,6 +36,7 @@ def _samples(t_us: int) -> list[tuple[str, tuple[object, ...]]]:
         ("HIGHRES_IMU", (t_us, 0.0, 0.0, -9.8, *(0.0,) * 10, 0, 0)),
         ("SERVO_OUTPUT_RAW", (t_us, 0, *(1570,) * 8, *(0,) * 8)),
         ("ATTITUDE_TARGET", (ms, 0, q, 0.0, 0.0, 0.0, 0.57)),
+        ("ACTUATOR_CONTROL_TARGET", (t_us, 0, (0.01,) * 8)),
         ("ATT_POS_MOCAP", (t_us, q, 0.0, 0.0, -5.0, (0.0,) * 21)),
         ("ATTITUDE_QUATERNION", (ms, *q, 0.0, 0.0, 0.0, (0.0,) * 4)),
     ]
