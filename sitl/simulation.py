@@ -106,9 +106,7 @@ class Simulation:
                 continue
             if self.lockstep and not self._answered and self._is_start(link, frame):
                 continue
-            t_us = self._barriers[0] if self._barriers else self.t_us
-            if self._record is not None:
-                self._heard.append((self.epoch_us + t_us, frame.raw))
+            t_us = self._hear(frame.raw)
             if frame.msgid == _TIMESYNC and link is self.partner and self._answers(frame) and not self._forged(frame):
                 answered = True
                 self._answered += 1
@@ -277,16 +275,25 @@ class Simulation:
         if self._record is not None:
             self._records.append((self.epoch_us + t_us, raw))
 
+    @property
+    def _said_us(self) -> int:
+        """When a peer says what arrives now: at the oldest barrier that has no answer yet."""
+        return self._barriers[0] if self._barriers else self.t_us
+
+    def _hear(self, raw: bytes) -> int:
+        """Keep a frame for the log; when it was said."""
+        t_us = self._said_us
+        if self._record is not None:
+            self._heard.append((self.epoch_us + t_us, raw))
+        return t_us
+
     def _answers(self, frame: Frame) -> bool:
         m = wire.decode(frame)
         return bool(self._barriers and m.ts1 == 1000 * self._barriers[0] and m.tc1 != 0)
 
     def _forged(self, frame: Frame) -> bool:
         """Whether a frame of the lockstep itself is not our partner's; its time is that of the barrier."""
-        if self.signer is None:
-            return False
-        t_us = self._barriers[0] if self._barriers else self.t_us
-        return self.signer.refuses(frame, self.epoch_us + t_us, new=False) != ""
+        return self.signer is not None and self.signer.refuses(frame, self.epoch_us + self._said_us, new=False) != ""
 
     def _refuse(self, reason: str) -> None:
         self.refused[reason] = self.refused.get(reason, 0) + 1
@@ -308,9 +315,7 @@ class Simulation:
             self._first_heartbeat = frame.raw
             return True
         if self._first_heartbeat is not None:
-            link.up.put(self._barriers[0], self._first_heartbeat)
-            if self._record is not None:
-                self._heard.append((self.epoch_us + self._barriers[0], self._first_heartbeat))
+            link.up.put(self._hear(self._first_heartbeat), self._first_heartbeat)
             self._first_heartbeat = None
         return False
 
