@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     from tools import fly, summary
 
     sides = {"left": _options(args, args.left), "right": _options(args, args.right)}
-    if args.right != BEST:  # what is wrong with it is known before the other flies
+    if args.right != BEST or args.set:  # what is wrong with it is known before the other flies
         from mavquad import plan
 
         plan.build(fly.resolve(sides["right"]).companion)

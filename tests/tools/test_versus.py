@@ -44,3 +44,9 @@ def test_a_side_that_does_not_exist_is_refused_before_anything_flies(tmp_path, s
     with pytest.raises(ConfigError, match="mpcc"):
         versus.run(options(side, "mpcc", "--run", str(tmp_path / "run")))
     assert not (tmp_path / "run").exists()
+
+
+def test_a_change_that_only_the_right_side_refuses_is_known_before_the_left_one_flies(tmp_path):
+    with pytest.raises(ConfigError, match="horizn"):
+        versus.run(options("hover", "--set", "eskf-mpc.horizn=3", "--run", str(tmp_path / "run")))
+    assert not (tmp_path / "run").exists()
