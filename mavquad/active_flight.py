@@ -18,7 +18,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from mavquad import linalg, quat
+from mavquad import active_common, linalg, quat
 from mavquad.airframe import Airframe, ModelBounds
 from mavquad.compensate import active_model
 from mavquad.errors import ConfigError
@@ -63,10 +63,7 @@ class Params:
     b_f_attitude_rad_s: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.authority <= 1.0:
-            raise ConfigError(f"asmf.authority = {self.authority}: expected 0 to 1")
-        if not (self.delay_s == -1.0 or 0.0 <= self.delay_s <= 0.3):
-            raise ConfigError(f"asmf.delay_s = {self.delay_s}: expected 0 to 0.3 s, or -1 for the measured delay")
+        active_common.check(self.authority, self.delay_s)
 
 
 class Gains(NamedTuple):
@@ -148,16 +145,16 @@ def uses(gains: Gains) -> tuple[str, ...]:
 def observe(gains: Gains, state: State, sample: object) -> State:
     """Keep what arrived until the next step; what is not finite is dropped."""
     if isinstance(sample, Imu):
-        if not _finite(sample.accel_m_s2):
+        if not active_common.finite(sample.accel_m_s2):
             return state
         total = linalg.add(state.imu_sum_m_s2, sample.accel_m_s2)
         return state._replace(imu_sum_m_s2=total, imu_count=state.imu_count + 1, imu_us=state.imu_us + sample.t_us)
     if isinstance(sample, Attitude):
-        return state._replace(attitude=sample) if _finite(sample.q_wxyz) else state
+        return state._replace(attitude=sample) if active_common.finite(sample.q_wxyz) else state
     if isinstance(sample, Position):
-        return state._replace(velocity=sample) if _finite(sample.v_ned_m_s) else state
+        return state._replace(velocity=sample) if active_common.finite(sample.v_ned_m_s) else state
     if isinstance(sample, Target):
-        if not (_finite(sample.q_wxyz) and math.isfinite(sample.thrust)):
+        if not (active_common.finite(sample.q_wxyz) and math.isfinite(sample.thrust)):
             return state
         return state._replace(echo=sample, followed_us=sample.t_us if _followed(state, sample) else state.followed_us)
     return state
@@ -173,11 +170,11 @@ def step(
     demand_at: Callable[[int], Demand] | None = None,
 ) -> tuple[State, Command]:
     """One control tick: the model error up to t_us, and the nominal command corrected by it."""
-    active = _finite(nominal.a_ned_m_s2)
+    active = active_common.finite(nominal.a_ned_m_s2)
     if state.attitude is None or state.velocity is None:
         return state._replace(t_us=t_us, active=active, authority=0.0), nominal
     roll, pitch, _ = quat.to_euler(applied.q_wxyz)
-    if _finite(applied.q_wxyz) and math.isfinite(applied.thrust_m_s2):
+    if active_common.finite(applied.q_wxyz) and math.isfinite(applied.thrust_m_s2):
         sent = np.array([roll, pitch, applied.thrust_m_s2])
         state = state._replace(line=command_line.push(state.line, state.t_us, sent))
     dt_s = 1e-6 * (t_us - state.t_us)
@@ -240,7 +237,7 @@ def _acting(gains: Gains, state: State, applied: Applied, t_us: int, dt_s: float
     if echo is not None and fresh and t_us - state.followed_us > 1e6 * ECHO_S:
         roll, pitch, _ = quat.to_euler(echo.q_wxyz)
         return (roll, pitch, G_M_S2 * echo.thrust / gains.hover_thrust)
-    delay_s = gains.delay_s if gains.delay_s >= 0.0 else (applied.delay_s if math.isfinite(applied.delay_s) else 0.0)
+    delay_s = gains.delay_s if gains.delay_s >= 0.0 else active_common.measured_delay_s(applied)
     middle_us = t_us - round(1e6 * (0.5 * dt_s + delay_s))
     thrust = state.line.value[command_line.index_at(state.line, middle_us), 2]
     tilt = state.line.value[command_line.index_at(state.line, middle_us - round(1e6 * gains.own_delay_s))]
@@ -283,7 +280,7 @@ def _correct(gains: Gains, state: State, nominal: Command, t_us: int, dt_s: floa
     stale_s = 1e-6 * (t_us - state.velocity_us) - STALE_S
     if stale_s > 0.0:
         f = linalg.scale(math.exp(-dt_s / STALE_TAU_S), state.f_ned_m_s2)
-    own = nominal.f_cancelled_m_s2 if _finite(nominal.f_cancelled_m_s2) else ZERO3
+    own = nominal.f_cancelled_m_s2 if active_common.finite(nominal.f_cancelled_m_s2) else ZERO3
     authority, a, given_back, cancelled = _share(
         gains.correction, state.authority, gains.authority * state.left, _half_width(model), dt_s,
         nominal.a_ned_m_s2, nominal.yaw_rad, own, cuts, f, (float(x[8]), float(x[9])),
@@ -306,7 +303,3 @@ def _share(correction, before, wanted, half_width, dt_s, nominal, yaw_rad, own, 
     given_back = linalg.sub(own, believed)
     a = active_model.correct(correction, linalg.add(nominal, given_back), yaw_rad, f, f_attitude, authority)
     return authority, a, given_back, linalg.axpy(authority, f, believed)
-
-
-def _finite(values: tuple[float, ...]) -> bool:
-    return math.isfinite(sum(values))

@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mavquad import linalg, quat
+from mavquad import active_common, linalg, quat
 from mavquad.airframe import Airframe
 from mavquad.compensate import helicopter
 from mavquad.errors import ConfigError
@@ -56,16 +56,11 @@ class Params:
     e_rate_rad_s: float = 0.025
     e_velocity_m_s: float = 0.15
     b_f: tuple[float, ...] = (0.03, 0.2, 0.03, 0.3, 0.06, 0.06)
-    delay_s: float = (
-        -1.0
-    )  # from a measurement to the sticks made of it; -1: the measured delay and half a period of the inner loop
+    delay_s: float = -1.0  # from a measurement to the sticks made of it; -1: as measured, and half a period of the inner loop
     integral_1_s: float = 0.2
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.authority <= 1.0:
-            raise ConfigError(f"asmf.authority = {self.authority}: expected 0 to 1")
-        if not (self.delay_s == -1.0 or 0.0 <= self.delay_s <= 0.3):
-            raise ConfigError(f"asmf.delay_s = {self.delay_s}: expected 0 to 0.3 s, or -1 for the measured delay")
+        active_common.check(self.authority, self.delay_s)
 
 
 class Gains(NamedTuple):
@@ -131,11 +126,11 @@ def uses(gains: Gains) -> tuple[str, ...]:
 def observe(gains: Gains, state: State, sample: object) -> State:
     """Keep what arrived until the next step; what is not finite is dropped."""
     if isinstance(sample, Attitude):
-        return state._replace(attitude=sample) if _finite((*sample.q_wxyz, *sample.omega_rad_s)) else state
+        return state._replace(attitude=sample) if active_common.finite((*sample.q_wxyz, *sample.omega_rad_s)) else state
     if isinstance(sample, Position):
-        return state._replace(velocity=sample) if _finite((*sample.p_ned_m, *sample.v_ned_m_s)) else state
+        return state._replace(velocity=sample) if active_common.finite((*sample.p_ned_m, *sample.v_ned_m_s)) else state
     if isinstance(sample, Controls):
-        if not _finite(sample.sticks):
+        if not active_common.finite(sample.sticks):
             return state
         lat, lon, ped, col = sample.sticks
         value = np.array([lon, lat, ped, col])
@@ -167,7 +162,7 @@ def step(
     assert state.model is not None
     authority = gains.authority * asmf.authority(state.model, t_us)
     settled = t_us - state.begun_us >= 1e6 * READY_S and 1e-6 * (t_us - velocity.t_us) <= FRESH_S
-    if settled and authority > 0.0 and _finite(nominal.a_ned_m_s2):
+    if settled and authority > 0.0 and active_common.finite(nominal.a_ned_m_s2):
         state, stick = _fly(gains, state, attitude, velocity, authority, delay_s, t_us, demand_at)
         lon, lat, ped, col = (float(v) for v in stick)
         sticks = (lon, lat, ped, col)
@@ -310,14 +305,10 @@ def _outputs(attitude: Attitude, velocity: Position) -> np.ndarray:
 def _delay_s(gains: Gains, applied: Applied) -> float:
     if gains.delay_s >= 0.0:
         return gains.delay_s
-    return (applied.delay_s if math.isfinite(applied.delay_s) else 0.0) + 0.5e-6 * TICK_US
+    return active_common.measured_delay_s(applied) + 0.5e-6 * TICK_US
 
 
 def _wire(sticks: Sticks) -> Sticks:
     """(lon, lat, ped, col) in the order of MAVLink's controls: roll, pitch, yaw, throttle."""
     lon, lat, ped, col = sticks
     return (lat, lon, ped, col)
-
-
-def _finite(values: tuple[float, ...]) -> bool:
-    return all(math.isfinite(v) for v in values)
