@@ -56,8 +56,8 @@ def step(plan: Plan, f: Flight, t_us: int, dt_s: float) -> None:
         )
         command = nominal
         if hasattr(plan.controller.module, "messages"):  # a controller with something to say beside its setpoint
-            module, gains = plan.controller.module, plan.controller.gains
-            outbox.send_all(plan, f, module.messages(gains, before, f.controller, t_us, f.life.target))
+            said = plan.controller.module.messages(plan.controller.gains, before, f.controller, t_us, f.life.target)
+            outbox.send_all(plan, f, said)
     if plan.compensator is not None:
         f.compensator, corrected = plan.compensator.module.step(
             plan.compensator.gains, f.compensator, estimate, nominal, applied, t_us, lambda t: demand_at(plan, f, t)
