@@ -9,10 +9,11 @@ Source: MAVLink serialisation and signing, https://mavlink.io/en/guide/serializa
 
 import hashlib
 import hmac
+import itertools
 import re
 import struct
 from collections import namedtuple
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 from fastcrc.crc16 import mcrf4xx
@@ -27,11 +28,11 @@ STX_V2 = 0xFD
 SIGNED = 0x01  # incompatibility flag
 SIGNATURE_LENGTH = 13
 MAX_FRAME = 10 + 255 + 2 + SIGNATURE_LENGTH
-_HEADER_V2 = struct.Struct("<BBBBBBHB")  # (STX,) length, two flags, sequence, system, component, message id
+_HEADER_V2 = "<BHBBB3s"  # (STX,) length, two flags, sequence, system, component, message id
 _READ_V2 = struct.Struct("<xBBxBBBHB").unpack_from  # the same as it is read, without STX and the second flags
 _HEADER_V1 = struct.Struct("<BBBBBB")  # STX, length, sequence, system, component, message id
 _CRC = struct.Struct("<H")
-
+_ITEM = re.compile(r"(\d*)([a-zA-Z])")  # of a struct's format
 
 _MISFITS = (struct.error, IndexError, TypeError, OverflowError)
 _new = tuple.__new__
@@ -55,10 +56,32 @@ def _cut(value: bytes) -> str:
     return value.split(b"\0", 1)[0].decode("utf-8", "replace")
 
 
+def _joined(items: list[str], at: int, there: int, text: bool) -> str:
+    """The expression of a field from those of its items, of which the first is number `at` and `there` of all arrived."""
+    if text:
+        return f"cut({items[0]})" if at < there else "''"
+    if len(items) == 1:
+        return items[0]
+    return f"v[{at}:{at + len(items)}]" if at + len(items) <= there else f"({', '.join(items)})"
+
+
 class Spec:
     """How one message is laid out; `make(*fields)` is its NamedTuple."""
 
-    __slots__ = ("_extra", "_id", "_pack", "_unpack", "addressed", "crc_extra", "length", "make", "msgid", "name", "struct")
+    __slots__ = (
+        "_body",
+        "_extra",
+        "_pack",
+        "_slots",
+        "addressed",
+        "crc_extra",
+        "length",
+        "make",
+        "msgid",
+        "name",
+        "read",
+        "struct",
+    )
 
     def __init__(self, cls: Any) -> None:
         self.msgid: int = cls.id
@@ -71,25 +94,49 @@ class Spec:
         self.make = make
         self.addressed = "target_system" in cls.fieldnames
         wire_names = list(cls.ordered_fieldnames)
-        self._id = (cls.id & 0xFFFF, cls.id >> 16)
         kinds = dict(zip(cls.fieldnames, cls.fieldtypes, strict=True))
         texts = {name for name, n in zip(wire_names, cls.array_lengths, strict=True) if n and kinds[name] == "char"}
-        # one generated expression each way, with every item in its place: several times faster than loops over tables
-        packed, unpacked, at = [], {}, 0
+        # generated expressions with every item in its place: several times faster than loops over tables
+        packed, slots, at = [], {}, 0
         for name, n in zip(wire_names, cls.lengths, strict=True):  # a text is one item of its struct, a numeric array many
             i = cls.fieldnames.index(name)
             packed.append(f"text(f[{i}])" if name in texts else f"*f[{i}]" if n > 1 else f"f[{i}]")
-            unpacked[name] = f"cut(v[{at}])" if name in texts else f"v[{at}:{at + n}]" if n > 1 else f"v[{at}]"
+            slots[i] = (at, n, name in texts)
             at += n
-        names = {"pack": self.struct.pack, "new": tuple.__new__, "make": make, "text": _text, "cut": _cut}
+        self._slots = [slots[i] for i in range(len(slots))]  # of each field: first item, items, whether it is a text
+        names = {"pack": self.struct.pack, "whole": struct.Struct(_HEADER_V2 + self.struct.format[1:]).pack, "text": _text}
+        start = f"{self.length}, 0, seq & 0xFF, system, component, {cls.id.to_bytes(3, 'little')!r}"
         self._pack: Any = eval(f"lambda f: pack({', '.join(packed)})", names)
-        self._unpack: Any = eval(f"lambda v: new(make, ({', '.join(unpacked[name] for name in cls.fieldnames)},))", names)
+        self._body: Any = eval(f"lambda f, seq, system, component: whole({start}, {', '.join(packed)})", names)
+        self.read = _Readers(self.reader)
+
+    def reader(self, length: int) -> Callable[[bytes, int], Any]:
+        """The reader (bytes, where the payload begins) -> message of payloads of one length; what was trimmed are constants."""
+        codes = [
+            c for n, code in _ITEM.findall(self.struct.format) for c in ([n + code] if code == "s" else [code] * int(n or 1))
+        ]
+        sizes = list(itertools.accumulate(struct.calcsize(f"<{code}") for code in codes))
+        if length > self.length:
+            return self.read[self.length]
+        if length not in sizes:  # cut within an item
+            return lambda raw, at: self.unpack(raw[at : at + length])
+        there = sizes.index(length) + 1
+        zeros = self.struct.unpack(bytes(self.length))
+        items = [f"v[{i}]" if i < there else repr(zero) for i, zero in enumerate(zeros)]
+        fields = [_joined(items[at : at + n], at, there, text) for at, n, text in self._slots]
+        plain = fields == items and there == len(items)  # all as they lie
+        names = {
+            "unpack": struct.Struct("<" + "".join(codes[:there])).unpack_from,
+            "new": tuple.__new__,
+            "make": self.make,
+            "cut": _cut,
+        }
+        made = "unpack(raw, at)" if plain else f"(v := unpack(raw, at)) and ({', '.join(fields)},)"
+        return eval(f"lambda raw, at: new(make, {made})", names)
 
     def unpack(self, payload: bytes) -> Any:
         """The message from its payload, zero-extended where the sender trimmed it."""
-        if len(payload) < self.length:
-            payload = payload.ljust(self.length, b"\0")
-        return self._unpack(self.struct.unpack_from(payload))
+        return self.read[self.length](payload.ljust(self.length, b"\0"), 0)
 
     def pack(self, fields: tuple[Any, ...]) -> bytes:
         """The payload, untrimmed. Raises WireError where a field does not fit its type."""
@@ -101,6 +148,18 @@ class Spec:
     def misfit(self, fields: tuple[Any, ...], error: Exception) -> WireError:
         """Fields that `pack` cannot take."""
         return WireError(f"{self.name}{tuple(fields)!r} does not fit its layout {self.struct.format}: {error}")
+
+
+class _Readers(dict[int, Callable[[bytes, int], Any]]):
+    """Length of a payload -> its reader, made when first needed."""
+
+    def __init__(self, reader: Callable[[int], Callable[[bytes, int], Any]]) -> None:
+        super().__init__()
+        self._reader = reader
+
+    def __missing__(self, length: int) -> Callable[[bytes, int], Any]:
+        made = self[length] = self._reader(length)
+        return made
 
 
 class _Specs(dict[int, Spec]):
@@ -134,11 +193,12 @@ def encode(name: str, fields: tuple[Any, ...], *, seq: int, system: int, compone
     """One unsigned MAVLink 2 frame. Raises WireError where the fields do not fit."""
     s = _BY_NAME.get(name) or spec(name)
     try:
-        payload = s._pack(fields).rstrip(b"\0") or b"\0"
+        body = s._body(fields, seq, system, component)
     except _MISFITS as error:
         raise s.misfit(fields, error) from None
-    low, high = s._id
-    body = _HEADER_V2.pack(len(payload), 0, 0, seq & 0xFF, system, component, low, high) + payload
+    if not body[-1]:  # zeros at the end are not sent
+        payload = body[9:].rstrip(b"\0") or b"\0"
+        body = bytes((len(payload),)) + body[1:9] + payload
     return b"\xfd" + body + _CRC.pack(mcrf4xx(body + s._extra))
 
 
@@ -214,10 +274,7 @@ def decode(frame: Frame) -> Any:
     except KeyError:
         raise WireError(f"message id {frame.msgid} from {frame.system}/{frame.component} is in no known dialect") from None
     raw = frame.raw
-    payload = raw[10 : 10 + raw[1]] if raw[0] == STX_V2 else raw[6 : 6 + raw[1]]
-    if len(payload) < s.length:
-        payload = payload.ljust(s.length, b"\0")
-    return s._unpack(s.struct.unpack_from(payload))
+    return s.read[raw[1]](raw, 10 if raw[0] == STX_V2 else 6)
 
 
 def addressee(frame: Frame) -> tuple[int, int]:

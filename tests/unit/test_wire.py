@@ -162,3 +162,18 @@ def test_one_spoiled_byte_costs_one_frame(which, share, change):
     frames, _ = wire.datagram(b"".join([*_FRAMES[:which], bytes(raw), *_FRAMES[which + 1 :]]))
     found = [f.raw for f in frames]
     assert [raw for raw in found if raw in _FRAMES] == [raw for i, raw in enumerate(_FRAMES) if i != which]
+
+
+@pytest.mark.parametrize(
+    "name", ["ATTITUDE_QUATERNION", "SET_ATTITUDE_TARGET", "STATUSTEXT", "PARAM_VALUE", "SERVO_OUTPUT_RAW"]
+)
+def test_a_payload_of_any_length_is_read_as_if_zeros_followed(name):
+    spec, random_ = wire.spec(name), random.Random(name)
+    for length in range(1, 256):
+        payload = bytes(random_.choices(range(1, 127), k=length))  # no float of these is a NaN
+        whole = spec.unpack(payload.ljust(spec.length, b"\0"))
+        assert spec.read[length](b"0123456789" + payload + b"crc", 10) == whole
+        assert spec.unpack(payload) == whole
+        sent = dialect.mavlink_map[spec.msgid].unpacker.unpack(payload[: spec.length].ljust(spec.length, b"\0"))
+        fields = [x for x in whole if not isinstance(x, str | tuple)]
+        assert set(fields) <= set(sent)
