@@ -18,7 +18,7 @@ from mavquad.identify.timebase import Held, held_at
 G_M_S2 = 9.80665
 TICK_S = 0.02
 MARGIN = 1.3  # over the largest seen
-SMOOTH_S = 0.3  # faster than this is called error, slower is called model error
+SMOOTH_S = 0.3  # slower than this is the force; what is faster may be error or force (a motor at its limit): both bounds hold it
 ATTITUDE_SMOOTH_S = 0.12  # attitude moves up to 5 Hz and carries less noise
 SLOW_S = 2.0  # the accelerometer's offset against the velocity is told over this
 SHORTEST_S = 30.0
@@ -89,7 +89,7 @@ def bounds(flight: Calm) -> dict[str, Bound]:
         "e_attitude_rad": largest(error_angle, "rad", 2e-4),
         "e_acceleration_m_s2": largest(raw_f - f, "m/s^2", 0.02),
         "b_velocity_m_s": largest(_padded(v_left), "m/s per tick", 5e-4),
-        "b_f_m_s2": largest(_padded(np.diff(f, axis=0)), "m/s^2 per tick", 0.005),
+        "b_f_m_s2": largest(_padded(np.diff(raw_f, axis=0)), "m/s^2 per tick", 0.005),
         "b_attitude_rad": largest(_padded(step_left), "rad per tick", 5e-4),
         "b_f_attitude_rad_s": largest(_padded(np.diff(f_angle, axis=0)), "rad/s per tick", 0.01),
     }
