@@ -13,6 +13,7 @@ from mavquad.signals import Attitude, Controls, Imu, Mocap, Motors, Position, Qu
 
 Sample = Attitude | Controls | Imu | Mocap | Motors | Position | Target
 _SERVO_WRAP_US = 1 << 32
+_END_US = 1 << 62  # stamps are added to and subtracted in 64 bits
 
 
 def _unit(name: str, stamp: int, unit: str, q: Quat) -> Quat:
@@ -31,6 +32,13 @@ def _finite(name: str, stamp: int, unit: str, *values: float) -> None:
     for value in values:
         if not math.isfinite(value):
             raise LinkError(f"{name} at {stamp} {unit} holds {value}, expected finite numbers; sample refused")
+
+
+def _stamp(name: str, us: int) -> int:
+    """A stamp of 64 bits. Raises LinkError for one that no clock shows."""
+    if us >= _END_US:
+        raise LinkError(f"{name} is stamped {us} us, expected below 2^62; sample refused")
+    return us
 
 
 def attitude_quaternion(m: Any) -> Attitude:
@@ -60,14 +68,14 @@ def attitude(m: Any) -> Attitude:
 def mocap(m: Any) -> Mocap:
     """ATT_POS_MOCAP (#138): already us, NED, FRD."""
     _finite("ATT_POS_MOCAP", m.time_usec, "us", m.x, m.y, m.z)
-    return Mocap(m.time_usec, _unit("ATT_POS_MOCAP", m.time_usec, "us", m.q), (m.x, m.y, m.z))
+    return Mocap(_stamp("ATT_POS_MOCAP", m.time_usec), _unit("ATT_POS_MOCAP", m.time_usec, "us", m.q), (m.x, m.y, m.z))
 
 
 def imu(m: Any) -> Imu:
     """HIGHRES_IMU (#105): us, m/s^2, rad/s, FRD. Its magnetometer is not used."""
     us, ax, ay, az, p, q, r = m[:7]
     _finite("HIGHRES_IMU", us, "us", ax, ay, az, p, q, r)
-    return Imu(us, (ax, ay, az), (p, q, r))
+    return Imu(_stamp("HIGHRES_IMU", us), (ax, ay, az), (p, q, r))
 
 
 def position(m: Any) -> Position:
@@ -94,7 +102,7 @@ def controls(m: Any) -> Controls:
     """ACTUATOR_CONTROL_TARGET (#140): us; the first four of its controls are a helicopter's sticks."""
     lat, lon, ped, col = (float(x) for x in m.controls[:4])
     _finite("ACTUATOR_CONTROL_TARGET", m.time_usec, "us", lat, lon, ped, col)
-    return Controls(m.time_usec, (lat, lon, ped, col))
+    return Controls(_stamp("ACTUATOR_CONTROL_TARGET", m.time_usec), (lat, lon, ped, col))
 
 
 DECODERS: dict[str, Callable[[Any], Sample]] = {

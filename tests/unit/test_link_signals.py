@@ -44,6 +44,21 @@ def test_anything_not_finite_is_refused_whole():
         signals.imu(message("HIGHRES_IMU", 20, 0.0, 0.0, -9.8, 0.0, math.inf, 0.0, *(0.0,) * 7, 0, 0))
 
 
+@pytest.mark.parametrize(
+    ("decode", "name", "fields"),
+    [
+        (signals.imu, "HIGHRES_IMU", (0.0, 0.0, -9.8, *(0.0,) * 10, 0, 0)),
+        (signals.mocap, "ATT_POS_MOCAP", ((1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, (0.0,) * 21)),
+        (signals.controls, "ACTUATOR_CONTROL_TARGET", (0, (0.0,) * 8)),
+    ],
+)
+def test_a_stamp_of_64_bits_that_no_clock_shows_is_refused(decode, name, fields):
+    assert decode(message(name, (1 << 62) - 1, *fields)).t_us == (1 << 62) - 1
+    for us in (1 << 62, (1 << 63) + 5, (1 << 64) - 1):  # kernels count in signed 64 bits
+        with pytest.raises(LinkError, match=rf"{name} is stamped {us} us, expected below 2\^62; sample refused"):
+            decode(message(name, us, *fields))
+
+
 def test_pwm_becomes_zero_to_one():
     sample = signals.motors(message("SERVO_OUTPUT_RAW", 7, 0, 1000, 1500, 2000, 900, *(0,) * 12))
     assert sample.command == (0.0, 0.5, 1.0, 0.0)
