@@ -18,7 +18,7 @@ from mavquad.identify.timebase import Held, held_at
 G_M_S2 = 9.80665
 TICK_S = 0.02
 MARGIN = 1.3  # over the largest seen
-SMOOTH_S = 0.3  # slower than this is the force; what is faster may be error or force (a motor at its limit): both bounds hold it
+SMOOTH_S = 0.3  # slower is the force; faster may be error or force (a motor at its limit): both bounds hold it
 ATTITUDE_SMOOTH_S = 0.12  # attitude moves up to 5 Hz and carries less noise
 SLOW_S = 2.0  # the accelerometer's offset against the velocity is told over this
 SHORTEST_S = 30.0
