@@ -2,6 +2,7 @@
 
 import functools
 import math
+import os
 from pathlib import Path
 from typing import Literal
 
@@ -12,6 +13,7 @@ from mavquad.errors import ConfigError
 
 Vec3 = tuple[float, float, float]
 FOLDER = Path(__file__).resolve().parent / "airframes"
+_FOLDER = str(FOLDER)
 
 
 class Body(config.Section, frozen=True):
@@ -143,19 +145,24 @@ class Airframe(config.Section, frozen=True):
 
 def load(name_or_path: str, overrides: tuple[str, ...] = ()) -> Airframe:
     """An airframe by its name (one of ours) or by a path to a TOML file; overrides as in `config.override`."""
-    path = Path(name_or_path)
-    if path.suffix != ".toml":
-        path = FOLDER / f"{name_or_path}.toml"
-        if not path.is_file():
+    named = not name_or_path.endswith(".toml")
+    path = f"{_FOLDER}/{name_or_path}.toml" if named else name_or_path
+    try:
+        changed_ns = os.stat(path).st_mtime_ns
+    except OSError:
+        if named:
             known = ", ".join(sorted(p.stem for p in FOLDER.glob("*.toml")))
-            raise ConfigError(f"no airframe is called {name_or_path!r}; known: {known}; or give a path that ends in .toml")
-    return _loaded(path, path.stat().st_mtime_ns if path.is_file() else 0, tuple(overrides))
+            raise ConfigError(
+                f"no airframe is called {name_or_path!r}; known: {known}; or give a path that ends in .toml"
+            ) from None
+        changed_ns = 0
+    return _loaded(path, changed_ns, tuple(overrides))
 
 
 @functools.lru_cache(maxsize=64)
-def _loaded(path: Path, changed_ns: int, overrides: tuple[str, ...]) -> Airframe:
+def _loaded(path: str, changed_ns: int, overrides: tuple[str, ...]) -> Airframe:
     """Once per file and changes, until the file changes: campaigns load the same few again and again."""
-    data = config.read(path)
+    data = config.read(Path(path))
     for assignment in overrides:
         data = config.override(data, assignment)
     return config.convert(data, Airframe, str(path))

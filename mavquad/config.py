@@ -56,17 +56,17 @@ def load(path: Path, kind: type[T]) -> T:
 
 
 def override(data: dict[str, Any], assignment: str) -> dict[str, Any]:
-    """A copy of `data` with one `a.b=VALUE` applied: a number, a TOML value, or a change `+20%` / `-5%` of what is there."""
+    """A copy of `data`, new where it differs, with one `a.b=VALUE` applied: a number, a TOML value, or a change `+20%` / `-5%` of what is there."""
     dotted, equals, text = assignment.partition("=")
     keys = dotted.strip().split(".")
     if not equals or not all(keys):
         raise ConfigError(f"--set {assignment}: expected KEY.KEY=VALUE, e.g. body.mass_kg=+20%")
-    data = _copy(data)
+    data = dict(data)
     table: Any = data
     for i, key in enumerate(keys[:-1]):
-        if not isinstance(table, dict) or not isinstance(table.get(key), dict):
+        if not isinstance(table.get(key), dict):
             raise ConfigError(f"--set {assignment}: there is no [{'.'.join(keys[: i + 1])}]{_nearest(key, table)}")
-        table = table[key]
+        table[key] = table = dict(table[key])
     last = keys[-1]
     percent = re.fullmatch(r"([+-]\d+(?:\.\d+)?)%", text.strip())
     if percent:

@@ -78,14 +78,14 @@ class Vehicle:
     mav_type = 2
 
     def __init__(self, sitl: config.Sitl) -> None:
-        tuned, true = config.vehicles(sitl)
+        self.tuned, self.true = tuned, true = config.vehicles(sitl)
         self.dt_us = 1_000_000 // sitl.rate_hz
         self.t_us = 0  # vehicle time
         self.constants = Record(CONSTANTS)
         self.setpoint = Record(SETPOINT)
         self.state = Record(VEHICLE)
         self._gusts = wind.gust_table(sitl.wind.gusts)
-        self._generators = [np.random.default_rng([sitl.seed, 1 + i]) for i in range(len(_GENERATORS))]
+        self._generators = self._seeded(sitl.seed)
         self._normals = np.zeros((_BLOCK, sensors.COLUMNS))
         self._fill_body(sitl, true)
         self._fill_sensors(sitl)
@@ -111,6 +111,9 @@ class Vehicle:
     def actuate(self, steps: int) -> None:
         """That many steps, which the normals drawn last for."""
         advance(self.state.array, self.setpoint.array, self.constants.array, self._gusts, self._normals, steps)
+
+    def _seeded(self, seed: int) -> list[np.random.Generator]:
+        return [np.random.default_rng([seed, 1 + i]) for i in range(len(_GENERATORS))]
 
     def _draw(self) -> None:
         self._left = _BLOCK
@@ -161,7 +164,7 @@ class Vehicle:
         c["altitude_m"] = config.ORIGIN[2]
         c["nav_every"] = sitl.rate_hz // 50
         low, high = tuning.position_delay_ms
-        drawn = int(np.random.default_rng([sitl.seed, 97]).integers(low, high + 1))
+        drawn = int(np.random.default_rng([sitl.seed, 97]).integers(low, high + 1)) if low < high else low
         c["nav_delay"] = round(1e-3 * (drawn if n.position_delay_ms is None else n.position_delay_ms) * sitl.rate_hz)
         c["mocap_sigma"] = math.radians(n.mocap_deg)
         c["mocap_every"], c["mocap_delay"] = sitl.rate_hz // n.mocap_rate_hz, round(1e-3 * n.mocap_delay_ms * sitl.rate_hz)

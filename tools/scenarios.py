@@ -9,6 +9,7 @@ autopilot's own types; then changed by `--set`:
   pid.ki=0.4                 any other table tunes the stage of that name
 """
 
+import functools
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -108,15 +109,21 @@ def load(name_or_path: str, changes: list[str] | None = None) -> Scenario:
     path = Path(name_or_path)
     if path.suffix != ".toml":
         path = FOLDER / f"{name_or_path}.toml"
-        if name_or_path not in names():
+        if not path.is_file():
             raise ConfigError(
                 f"no scenario is called {name_or_path!r}; known: {', '.join(names())}; or give a path that ends in .toml"
             )
+    changed_ns = path.stat().st_mtime_ns if path.is_file() else 0
+    return config.convert(_changed(path, changed_ns, tuple(changes or ())), Scenario, str(path))
+
+
+@functools.lru_cache(maxsize=64)
+def _changed(path: Path, changed_ns: int, changes: tuple[str, ...]) -> dict[str, Any]:
+    """The tables of a scenario with these changes, for nobody to alter: the flights of a campaign begin with the same ones."""
+    if changes:
+        return _set(_changed(path, changed_ns, changes[:-1]), changes[-1])
     standard = msgspec.to_builtins(Scenario(about="", path=FlightPath()))
-    data = _over({**standard, "companion": _companion_tables()}, config.read(path))
-    for change in changes or []:
-        data = _set(data, change)
-    return config.convert(data, Scenario, str(path))
+    return _over({**standard, "companion": _companion_tables()}, config.read(path))
 
 
 def resolve(scenario: Scenario, options: Options) -> Resolved:

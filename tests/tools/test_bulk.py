@@ -8,11 +8,11 @@ import pytest
 
 from mavquad.errors import ConfigError
 from sitl.sensors import COLUMNS, sense
-from sitl.state import VEHICLE
+from sitl.state import VEHICLE, Record
 from tools import scenarios
 from tools.__main__ import main
-from tools.bulk import lean, setup, stepwise
-from tools.bulk.state import FLYING, LOST, TOUCHED, TRACE
+from tools.bulk import lean, normals, setup, stepwise
+from tools.bulk.state import FLYING, LOST, NOISE, TOUCHED, TRACE
 from tools.campaigns import compiled, grid
 
 SHORT = ("companion.settle_s=0.5", "path.turns=0.3", "flight.score_from_s=1")
@@ -67,6 +67,38 @@ def test_what_the_lean_sensors_leave_is_what_the_autopilots_sensors_leave():
     assert set(made) < set(VEHICLE.names)
     for name in made:
         assert vehicle.state[name].tobytes() == np.ascontiguousarray(other[name][0]).tobytes(), name
+
+
+def test_normals_in_a_record_are_those_of_numpys_generator():
+    seeds = [[5, k] for k in range(4)]
+    noise = Record(NOISE, generators=[normals.words(np.random.default_rng(seed)) for seed in seeds])
+    found = np.empty((4, 4000, COLUMNS))
+    for k, rows in enumerate(found):
+        for row in rows:
+            normals.draw(noise.array[0], k, 0, COLUMNS)
+            row[:] = noise["normals"]
+    assert np.abs(found).max() > 3.7  # beyond the tables' last layer too
+    wanted = np.stack([np.random.default_rng(seed).standard_normal((4000, COLUMNS)) for seed in seeds])
+    assert found.tobytes() == wanted.tobytes()
+
+
+def test_normals_passed_over_are_passed_over():
+    noise = Record(NOISE, generators=[normals.words(np.random.default_rng(k)) for k in range(4)])
+    generator = np.random.default_rng(2)
+    for count in (1, 4000, 7):
+        normals.skip(noise.array[0], 2, count)
+        generator.standard_normal(count)
+        normals.draw(noise.array[0], 2, 3, 4)
+        assert noise["normals"][3:7].tobytes() == generator.standard_normal(4).tobytes()
+    assert noise["generators"][1].tolist() == list(normals.words(np.random.default_rng(1)))
+
+
+def test_a_generators_step_is_the_same_without_the_compiler():
+    generator = np.random.default_rng(8)
+    for _ in range(20):
+        before = [np.uint64(word) for word in normals.words(generator)]
+        generator.bit_generator.random_raw()
+        assert normals._step_uncompiled(*before) == tuple(normals.words(generator)[:2])
 
 
 def test_the_same_seed_is_the_same_flight_in_one_call_or_in_many():

@@ -124,7 +124,7 @@ def _single(seconds: float) -> list[Row]:
         v, best = p.vehicle, math.inf
         for i in range(6):
             begun = time.perf_counter()
-            kernel(v.state.array, v.setpoint.array, v.constants.array, v._gusts, p.draws, p.normals, steps if i else 8)
+            kernel(v.state.array, v.setpoint.array, v.constants.array, v._gusts, p.noise.array, steps if i else 8)
             best = min(best, time.perf_counter() - begun) if i else best
         rows.append(Row(what, "ours, one core", 1e-6 * steps / best, "M steps/s", physics))
     best = math.inf

@@ -24,18 +24,17 @@ _NEVER = 1 << 62
 
 
 @kernel
-def fly(flight, vehicle, setpoint, constants, gusts, draws, normals, wires, gains, gate, path, until_us, trace):
-    """Fly on to `until_us`; leaves everything in the records. draws: generators of gyro, accelerometer, drift, position, motion
-    capture, air; wires: the rings down and up; trace: (n, 11) rows filled per control period, none where it is empty."""
-    f, s = flight[0], vehicle[0]
-    attitudes, positions, echoes, setpoints = wires
+def fly(flight, vehicle, setpoint, constants, gusts, noise, wires, gains, gate, path, until_us, trace):
+    """Fly on to `until_us`; leaves everything in the records. noise: its generators; wires: what is under way down and up;
+    trace: (n, 11) rows filled per control period, none where it is empty."""
+    f, s, sp, c, n, w = flight[0], vehicle[0], setpoint[0], constants[0], noise[0], wires[0]
     row = 0
     while f.t_us < until_us and f.ended == FLYING:
-        period(flight, vehicle, setpoint, constants, gusts, draws, normals, attitudes, positions, echoes, setpoints)
+        period(f, s, sp, c, n, w, gusts)
         if not f.engaged and f.t_us >= f.engage_us:
             engage(f)
-        _hear_echoes(f, echoes)
-        _deliver_down(f, attitudes, positions, setpoints, gains, gate, path)
+        _hear_echoes(f, w)
+        _deliver_down(f, w, gains, gate, path)
         _watch(f, s)
         if row < trace.shape[0]:
             _note(f, s, trace, row)
@@ -44,36 +43,35 @@ def fly(flight, vehicle, setpoint, constants, gusts, draws, normals, wires, gain
 
 
 @kernel
-def period(flight, vehicle, setpoint, constants, gusts, draws, normals, attitudes, positions, echoes, setpoints):
+def period(f, s, sp, c, n, w, gusts):
     """The autopilot's side of one control period."""
-    f, s, sp, c = flight[0], vehicle[0], setpoint[0], constants[0]
     end_us = f.t_us + f.period_us
     while f.t_us < end_us:
-        due_us = min(end_us, f.attitude_due_us, f.position_due_us, _deliver_up(f, sp, setpoints))
+        due_us = min(end_us, f.attitude_due_us, f.position_due_us, _deliver_up(f, sp, w))
         if not f.engaged:
             due_us = min(due_us, f.echo_due_us)
         steps = max(1, -(-(due_us - f.t_us) // f.step_us))
         for _ in range(steps):
-            lean.draw(s, c, draws, normals)
+            lean.draw(s, c, n)
             loops.run(s, sp, c)
             if s.step % c.air_every == 0:
-                air(s, c, gusts, normals)
+                air(s, c, gusts, n.normals)
             plant.step(s, c)
-            lean.sense(s, c, normals)
+            lean.sense(s, c, n.normals)
         f.t_us += steps * f.step_us
         if f.t_us >= f.position_due_us:
-            _send_position(f, s, positions)
+            _send_position(f, s, w)
         if f.t_us >= f.attitude_due_us:
-            _send_attitude(f, s, attitudes)
+            _send_attitude(f, s, w)
         if not f.engaged and f.t_us >= f.echo_due_us:
-            _send_echo(f, s, echoes)
+            _send_echo(f, s, w)
 
 
 @kernel
-def _send_position(f, s, positions):
+def _send_position(f, s, w):
     """Position and velocity as float32."""
     f.position_due_us += f.position_us
-    at = positions[f.position_next % ON_WIRE]
+    at = w.positions[f.position_next % ON_WIRE]
     at.t_us = f.t_us
     for i in range(3):
         at.p[i] = np.float64(np.float32(s.nav_p_ned_m[i]))
@@ -82,11 +80,11 @@ def _send_position(f, s, positions):
 
 
 @kernel
-def _send_attitude(f, s, attitudes):
+def _send_attitude(f, s, w):
     """The AHRS's quaternion; beside it the true position, for the scores."""
     f.attitude_due_us += f.attitude_us
     lean.quaternion(s)
-    to = attitudes[f.attitude_next % ON_WIRE]
+    to = w.attitudes[f.attitude_next % ON_WIRE]
     to.t_us = f.t_us
     q = _as_sent((s.ahrs_q_wxyz[0], s.ahrs_q_wxyz[1], s.ahrs_q_wxyz[2], s.ahrs_q_wxyz[3]))
     to.q[0], to.q[1], to.q[2], to.q[3] = q
@@ -96,10 +94,10 @@ def _send_attitude(f, s, attitudes):
 
 
 @kernel
-def _send_echo(f, s, echoes):
+def _send_echo(f, s, w):
     """What the autopilot's own loop asks for in the hover before."""
     f.echo_due_us += f.echo_us
-    echo = echoes[f.echo_next % ON_WIRE]
+    echo = w.echoes[f.echo_next % ON_WIRE]
     echo.t_us = f.t_us
     echo.thrust = np.float64(np.float32(s.thrust))
     q = _as_sent(rotation.to_quaternion(rotation.matrix(s.target_R)))
@@ -117,10 +115,10 @@ def _as_sent(q):
 
 
 @kernel
-def _deliver_up(f, sp, setpoints):
+def _deliver_up(f, sp, w):
     """Setpoints that have arrived at the autopilot, into the record that its loops read. Returns when the next one does."""
-    while f.setpoint_first < f.setpoint_next and setpoints[f.setpoint_first % ON_WIRE].due_us <= f.t_us:
-        got = setpoints[f.setpoint_first % ON_WIRE]
+    while f.setpoint_first < f.setpoint_next and w.setpoints[f.setpoint_first % ON_WIRE].due_us <= f.t_us:
+        got = w.setpoints[f.setpoint_first % ON_WIRE]
         f.setpoint_first += 1
         if f.controller == AUTOPILOT:
             sp.kind = POSITION
@@ -128,25 +126,25 @@ def _deliver_up(f, sp, setpoints):
             for i in range(3):
                 sp.p_ned_m[i], sp.v_ned_m_s[i], sp.a_ned_m_s2[i] = got.p[i], got.v[i], got.a[i]
         else:
-            w, x, y, z = got.q[0], got.q[1], got.q[2], got.q[3]
-            norm = math.sqrt(w * w + x * x + y * y + z * z)
-            R = rotation.from_quaternion((w / norm, x / norm, y / norm, z / norm))
+            q = got.q
+            norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+            R = rotation.from_quaternion((q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm))
             sp.kind = ATTITUDE
             sp.thrust = min(1.0, max(0.0, got.thrust))
             for i in range(3):
                 sp.rates_rad_s[i] = 0.0
             for i in range(9):
                 sp.R[i] = R[i]
-    return setpoints[f.setpoint_first % ON_WIRE].due_us if f.setpoint_first < f.setpoint_next else _NEVER
+    return w.setpoints[f.setpoint_first % ON_WIRE].due_us if f.setpoint_first < f.setpoint_next else _NEVER
 
 
 @kernel
-def _deliver_down(f, attitudes, positions, setpoints, gains, gate, path):
+def _deliver_down(f, w, gains, gate, path):
     """The companion's turn at the end of a control period: samples that have arrived, oldest first; control on the attitudes."""
     heard_us = f.t_us - f.delay_us
-    while f.attitude_first < f.attitude_next and attitudes[f.attitude_first % ON_WIRE].t_us <= heard_us:
-        sampled = attitudes[f.attitude_first % ON_WIRE]
-        _hear_positions(f, positions, sampled.t_us)
+    while f.attitude_first < f.attitude_next and w.attitudes[f.attitude_first % ON_WIRE].t_us <= heard_us:
+        sampled = w.attitudes[f.attitude_first % ON_WIRE]
+        _hear_positions(f, w, sampled.t_us)
         gap_us = sampled.t_us - f.last_attitude_us
         if 0 < gap_us < 200_000:
             f.gap_us = gap_us if f.gap_us == 0 else min(gap_us, f.gap_us)
@@ -154,15 +152,15 @@ def _deliver_down(f, attitudes, positions, setpoints, gains, gate, path):
         since_us = sampled.t_us - f.control_us
         if f.control_us == 0 or since_us >= f.wanted_gap_us - f.gap_us // 2:
             dt_s = min(0.2, 1e-6 * since_us) if f.control_us else 1e-6 * f.wanted_gap_us
-            _control(f, sampled, setpoints, gains, gate, path, dt_s)
+            _control(f, sampled, w, gains, gate, path, dt_s)
         f.attitude_first += 1
-    _hear_positions(f, positions, heard_us)
+    _hear_positions(f, w, heard_us)
 
 
 @kernel
-def _hear_positions(f, positions, until_us):
-    while f.position_first < f.position_next and positions[f.position_first % ON_WIRE].t_us <= until_us:
-        heard = positions[f.position_first % ON_WIRE]
+def _hear_positions(f, w, until_us):
+    while f.position_first < f.position_next and w.positions[f.position_first % ON_WIRE].t_us <= until_us:
+        heard = w.positions[f.position_first % ON_WIRE]
         f.position_stamp_us = heard.t_us
         for i in range(3):
             f.p[i], f.v[i] = heard.p[i], heard.v[i]
@@ -170,10 +168,10 @@ def _hear_positions(f, positions, until_us):
 
 
 @kernel
-def _hear_echoes(f, echoes):
+def _hear_echoes(f, w):
     """In the hover before setpoints flow, the thrust that the autopilot holds is what carries this vehicle."""
-    while f.echo_first < f.echo_next and echoes[f.echo_first % ON_WIRE].t_us <= f.t_us - f.delay_us:
-        echo = echoes[f.echo_first % ON_WIRE]
+    while f.echo_first < f.echo_next and w.echoes[f.echo_first % ON_WIRE].t_us <= f.t_us - f.delay_us:
+        echo = w.echoes[f.echo_first % ON_WIRE]
         if not f.engaged and 0.05 < echo.thrust < 0.95:
             f.hover_thrust += 0.05 * (echo.thrust * echo.upright - f.hover_thrust)
         f.echo_thrust = echo.thrust
@@ -181,7 +179,7 @@ def _hear_echoes(f, echoes):
 
 
 @kernel
-def _control(f, sampled, setpoints, gains, gate, path, dt_s):
+def _control(f, sampled, w, gains, gate, path, dt_s):
     """estimate -> control -> setpoint, once, on one attitude sample."""
     t_us = sampled.t_us
     f.control_us = t_us
@@ -196,7 +194,7 @@ def _control(f, sampled, setpoints, gains, gate, path, dt_s):
     p = (f.p[0] + age_s * v[0], f.p[1] + age_s * v[1], f.p[2] + age_s * v[2])
     dp, dv, da, _ = paths.evaluate(path, 1e-6 * (t_us - f.path_t0_us))
     ref = (f.anchor_p[0] + dp[0], f.anchor_p[1] + dp[1], f.anchor_p[2] + dp[2])
-    to = setpoints[f.setpoint_next % ON_WIRE]
+    to = w.setpoints[f.setpoint_next % ON_WIRE]
     if f.controller == AUTOPILOT:
         to.yaw = np.float64(np.float32(f.anchor_yaw))
         for i in range(3):

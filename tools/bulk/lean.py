@@ -6,21 +6,24 @@ made where it is sent (`sitl.sensors` makes it each step; two samples of it are 
 
 from mavquad.jit import kernel
 from sitl import rotation, sensors
+from tools.bulk import normals, state
 
 
 @kernel
-def draw(s, c, draws, n):
-    """The normals of one step, each from its sensor's own generator and in the simulated autopilot's order."""
-    gyro, _, drift, position, _, turbulence = draws
-    for i in range(3):
-        n[sensors.GYRO + i] = gyro.standard_normal()
-    for i in range(3):
-        n[sensors.DRIFT + i] = drift.standard_normal()
-    for i in range(6):
-        n[sensors.POSITION + i] = position.standard_normal()
+def draw(s, c, noise):
+    """The normals of one step, each from its sensor's own generator and in the simulated autopilot's order; those that this step
+    does not read are passed over."""
+    normals.draw(noise, state.GYRO, sensors.GYRO, 3)
+    normals.draw(noise, state.DRIFT, sensors.DRIFT, 3)
+    if (s.step + 1) % c.nav_every == 0:  # sensors sample after the plant's step
+        normals.draw(noise, state.POSITION, sensors.POSITION, 6)
+    else:
+        normals.skip(noise, state.POSITION, 6)
     if c.turbulent:
-        for i in range(7):
-            n[sensors.AIR + i] = turbulence.standard_normal()
+        if s.step % c.air_every == 0:
+            normals.draw(noise, state.AIR, sensors.AIR, 7)
+        else:
+            normals.skip(noise, state.AIR, 7)
 
 
 @kernel

@@ -7,7 +7,7 @@ from tools.bulk import lean
 
 
 @kernel
-def plant_alone(vehicle, setpoint, constants, gusts, draws, normals, steps):
+def plant_alone(vehicle, setpoint, constants, gusts, noise, steps):
     """The rigid body with its rotors under outputs that stay."""
     s, c = vehicle[0], constants[0]
     for _ in range(steps):
@@ -15,7 +15,7 @@ def plant_alone(vehicle, setpoint, constants, gusts, draws, normals, steps):
 
 
 @kernel
-def with_loops(vehicle, setpoint, constants, gusts, draws, normals, steps):
+def with_loops(vehicle, setpoint, constants, gusts, noise, steps):
     """The rigid body under the autopilot's loops, which know the truth."""
     s, sp, c = vehicle[0], setpoint[0], constants[0]
     for _ in range(steps):
@@ -28,13 +28,13 @@ def with_loops(vehicle, setpoint, constants, gusts, draws, normals, steps):
 
 
 @kernel
-def with_sensors(vehicle, setpoint, constants, gusts, draws, normals, steps):
+def with_sensors(vehicle, setpoint, constants, gusts, noise, steps):
     """The same under noisy sensors and turbulence."""
-    s, sp, c = vehicle[0], setpoint[0], constants[0]
+    s, sp, c, n = vehicle[0], setpoint[0], constants[0], noise[0]
     for _ in range(steps):
-        lean.draw(s, c, draws, normals)
+        lean.draw(s, c, n)
         loops.run(s, sp, c)
         if s.step % c.air_every == 0:
-            air(s, c, gusts, normals)
+            air(s, c, gusts, n.normals)
         plant.step(s, c)
-        lean.sense(s, c, normals)
+        lean.sense(s, c, n.normals)

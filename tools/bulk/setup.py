@@ -10,16 +10,16 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
+from mavquad import airframe
 from mavquad import plan as plans
-from mavquad.jit import COMPILED
 from mavquad.settings import Companion
 from sitl import config, px4
 from sitl.params import Table
 from sitl.plant import GRAVITY_M_S2
-from sitl.sensors import COLUMNS
 from sitl.state import POSITION, Record
 from sitl.vehicle import Vehicle
-from tools.bulk.state import ATTITUDES, AUTOPILOT, ECHOES, FLIGHT, ON_WIRE, PID, POSITIONS, SETPOINTS, TRACE
+from tools.bulk import normals
+from tools.bulk.state import AUTOPILOT, DRAWN, FLIGHT, NOISE, PID, TRACE, WIRES
 from tools.scenarios import Resolved
 
 # whole numbers of control periods, and of the blocks in which the simulated autopilot draws
@@ -35,9 +35,8 @@ class Prepared(NamedTuple):
 
     flight: Record
     vehicle: Vehicle
-    draws: tuple[np.random.Generator, ...]
-    normals: np.ndarray  # (25,) of one step
-    wires: tuple[np.ndarray, ...]
+    noise: Record
+    wires: Record
     plan: plans.Plan
     end_us: int
 
@@ -45,8 +44,15 @@ class Prepared(NamedTuple):
 class _Undrawn(Vehicle):
     """A vehicle whose noise is drawn step by step inside the compiled flight."""
 
+    def _seeded(self, seed: int) -> list[np.random.Generator]:
+        return [np.random.default_rng([seed, 1 + i]) for i in DRAWN]
+
     def _draw(self) -> None:
         self._left = 0
+
+    def noise(self) -> Record:
+        """The generators, undrawn, for the compiled flight."""
+        return Record(NOISE, generators=[normals.words(generator) for generator in self._generators])
 
 
 def start_us(sitl: config.Sitl) -> int:
@@ -63,7 +69,7 @@ def end_us(plan: plans.Plan, sitl: config.Sitl) -> int:
 def why_not(resolved: Resolved) -> str:
     """Why a flight cannot begin in the air at all, or nothing."""
     sitl = resolved.sitl
-    if config.vehicles(sitl)[1].kind != "quadrotor":
+    if airframe.load(sitl.airframe, tuple(sitl.overrides)).kind != "quadrotor":
         return f"airframe {sitl.airframe} is no quadrotor"
     if resolved.companion.controller == "sweep":
         return "controller sweep identifies in a flight of its own"
@@ -103,8 +109,7 @@ def prepare(resolved: Resolved) -> Prepared:
     """Everything that one compiled flight works on. Ask `why_not_fused` before."""
     sitl, plan = resolved.sitl, plan_of(resolved)
     vehicle = _Undrawn(sitl)
-    tuned, _ = config.vehicles(sitl)
-    autopilot = px4.Px4(vehicle, Table(px4.defaults(tuned), sitl.params, bytewise=True), _silent)
+    autopilot = px4.Px4(vehicle, Table(px4.defaults(vehicle.tuned), sitl.params, bytewise=True), _silent)
     lift_off(vehicle, sitl, autopilot, plan.settings.takeoff_m)
     flight = Record(FLIGHT)
     intervals = [_interval(vehicle, plan, name) for name in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "ATTITUDE_TARGET")]
@@ -129,9 +134,7 @@ def prepare(resolved: Resolved) -> Prepared:
         "score_to_us": round(1e6 * (plan.settings.settle_s + plan.path.duration_s)),
     }.items():
         flight[name] = value
-    draws = tuple(np.random.default_rng([sitl.seed, 1 + i]) for i in range(6))
-    wires = tuple(_ring(dtype) for dtype in (ATTITUDES, POSITIONS, ECHOES, SETPOINTS))
-    return Prepared(flight, vehicle, draws, np.zeros(COLUMNS), wires, plan, end_us(plan, sitl))
+    return Prepared(flight, vehicle, vehicle.noise(), Record(WIRES), plan, end_us(plan, sitl))
 
 
 def fly(p: Prepared, until_us: int | None = None, trace: np.ndarray | None = None) -> int:
@@ -144,14 +147,14 @@ def fly(p: Prepared, until_us: int | None = None, trace: np.ndarray | None = Non
     records = (p.flight.array, v.state.array, v.setpoint.array, v.constants.array)
     return int(
         fused.fly(
-            *records, v._gusts, p.draws, p.normals, p.wires, gains, p.plan.limits, p.plan.path, until_us or p.end_us, rows
+            *records, v._gusts, p.noise.array, p.wires.array, gains, p.plan.limits, p.plan.path, until_us or p.end_us, rows
         )
     )
 
 
 def lift_off(vehicle: Vehicle, sitl: config.Sitl, autopilot: Any, height_m: float) -> None:
     """From the ground into a hover over the same place, rotors and integrals as they are after a while of it."""
-    tuned, true = config.vehicles(sitl)
+    tuned, true = vehicle.tuned, vehicle.true
     assert tuned.rotors is not None
     assert true.rotors is not None
     s, here = vehicle.state, sitl.start.p_ned_m
@@ -181,11 +184,6 @@ def _interval(vehicle: Vehicle, plan: plans.Plan, name: str) -> int:
 
 def _first(interval_us: int) -> int:
     return (START_US // interval_us + 1) * interval_us
-
-
-def _ring(dtype: np.dtype) -> np.ndarray:
-    ring = np.zeros(ON_WIRE, dtype)
-    return ring if COMPILED else ring.view(np.recarray)
 
 
 def _silent(severity: int, text: str) -> None:

@@ -2,8 +2,12 @@
 
 import numpy as np
 
+from sitl.sensors import COLUMNS
+
 ON_WIRE = 512  # samples or setpoints under way at most: a second of delay and more
 PID, AUTOPILOT = 0, 1  # FLIGHT.controller: the integer branch of the fused function
+GYRO, DRIFT, POSITION, AIR = 0, 1, 2, 3  # NOISE.generators
+DRAWN = (0, 2, 3, 5)  # which of the simulated autopilot's generators these are
 FLYING, TOUCHED, LOST = 0, 1, 2  # FLIGHT.ended
 
 FLIGHT = np.dtype(
@@ -60,10 +64,19 @@ FLIGHT = np.dtype(
     ]
 )
 
+NOISE = np.dtype([("generators", "u8", (4, 4)), ("normals", "f8", COLUMNS)])  # by number below; of one step
 ATTITUDES = np.dtype([("t_us", "i8"), ("q", "f8", 4), ("p_true", "f8", 3)])
 ECHOES = np.dtype([("t_us", "i8"), ("thrust", "f8"), ("upright", "f8")])
 POSITIONS = np.dtype([("t_us", "i8"), ("p", "f8", 3), ("v", "f8", 3)])
 SETPOINTS = np.dtype(
     [("due_us", "i8"), ("q", "f8", 4), ("thrust", "f8"), ("p", "f8", 3), ("v", "f8", 3), ("a", "f8", 3), ("yaw", "f8")]
+)
+WIRES = np.dtype(
+    [
+        ("attitudes", ATTITUDES, ON_WIRE),
+        ("positions", POSITIONS, ON_WIRE),
+        ("echoes", ECHOES, ON_WIRE),
+        ("setpoints", SETPOINTS, ON_WIRE),
+    ]
 )
 TRACE = 11  # columns per control period: t_us, true p, v, thrust axis, collective asked for

@@ -1,6 +1,7 @@
 """A campaign's flights as two real processes over UDP, each by the same code as `mavquad fly`; its run folder goes unless kept."""
 
 import argparse
+import copy
 import functools
 import shutil
 from pathlib import Path
@@ -24,8 +25,16 @@ def _parser() -> argparse.ArgumentParser:
 
 def resolve(words: tuple[str, ...]) -> tuple[argparse.Namespace, Any]:
     """(the options of `mavquad fly`, both programs' configurations). Raises ConfigError."""
-    args = _parser().parse_args(words)
+    changes = [i for i in range(len(words) - 1) if words[i] == "--set"]
+    args = copy.copy(_options(tuple(word for i, word in enumerate(words) if i not in changes and i - 1 not in changes)))
+    args.set = [words[i + 1] for i in changes]
     return args, fly.resolve(args)
+
+
+@functools.lru_cache(maxsize=64)
+def _options(words: tuple[str, ...]) -> argparse.Namespace:
+    """Without changes the flights of a campaign have the same few options."""
+    return _parser().parse_args(words)
 
 
 def prepare(flights: list[Flight], say: Any) -> None:
