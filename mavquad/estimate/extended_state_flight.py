@@ -30,7 +30,7 @@ from mavquad.signals import NAN3, ZERO3, Applied, Attitude, Estimate, Position, 
 G_M_S2 = 9.80665
 _NO_RATE = 1e9  # variance of a velocity that did not come
 _LATE_S = 0.25  # a position older than the filter by more is not used
-_COAST_S = 0.5  # the longest step without samples that is integrated
+_COAST_S = 1.5  # the longest silence that is integrated over; beyond it the filter begins again where it is
 _ECHO_S = 0.3  # an echo older than this is not the present thrust
 _SAME = 1e-6  # collectives this near are one: a float's rounding
 _JUDGE = 0.05  # how quickly the growth of f follows the innovations, per sample
@@ -247,10 +247,10 @@ def observe(gains: Gains, state: State, sample: object) -> State:
 def _to(gains: Gains, state: State, t_us: int) -> State:
     """The filter at t: by the present attitude, and the thrust that acts between."""
     dt_s = 1e-6 * (t_us - state.t_us)
-    if not state.t_us or dt_s < 0.0 or dt_s > _COAST_S:
-        return state._replace(t_us=max(t_us, state.t_us)) if dt_s > 0.0 else state
-    if dt_s == 0.0:
+    if dt_s <= 0.0:
         return state
+    if not state.t_us or dt_s > _COAST_S:
+        return state._replace(t_us=t_us, axes=None)
     wanted = _thrust(gains, state, t_us)
     keep = math.exp(-dt_s / gains.thrust_lag_s) if gains.thrust_lag_s > 1e-4 else 0.0
     thrust = wanted + keep * (state.thrust_m_s2 - wanted)

@@ -26,13 +26,14 @@ def _fly(gains, seconds, f, *, q=quat.IDENTITY, thrust=G, thrust_true=None, echo
         p, v = p + 4e-3 * v + 8e-6 * a, v + 4e-3 * a
         samples = [Attitude(1000 * ms, q, ZERO3)]
         if ms % 20 == 0:
-            samples.append(Position(1000 * ms, tuple(p), tuple(v + bias)))
-            if echo is not None:
-                samples.append(Target(1000 * ms, q, NAN3, echo, 7))
+            told = [Target(1000 * ms, q, NAN3, echo, 7)] if echo is not None else []
+            samples = [Position(1000 * ms, tuple(p), tuple(v + bias)), *told, *samples]
         for sample in samples:
             sample = spoil(sample) if spoil else sample
             if sample is not None:
                 state = flight.observe(gains, state, sample)
+        if sample is None:  # the attitude paces the control
+            continue
         state, estimate = flight.step(gains, state, Applied(1000 * ms, q, thrust, NAN3, delay_s), 1000 * ms)
     return state, estimate, (p, v)
 
@@ -44,6 +45,19 @@ def test_a_constant_disturbance_is_found_beside_the_known_drag():
     np.testing.assert_allclose(estimate.p_ned_m, p, atol=0.02)
     np.testing.assert_allclose(estimate.v_ned_m_s, v, atol=0.02)
     np.testing.assert_allclose(estimate.f_ned_m_s2, np.array(f) - 0.2 * v, atol=0.03)  # the total, drag included
+
+
+@pytest.mark.parametrize(("silence_s", "near_m"), [(0.6, 0.01), (1.4, 0.01), (3.0, 0.05)])
+def test_after_a_silence_the_vehicle_is_where_it_flew_to(silence_s, near_m):
+    """The filter left where it was would be 1.5 m behind, and believe in it; past what it integrates it begins again."""
+
+    def silent(sample):
+        return None if 4e6 <= sample.t_us < 4e6 + 1e6 * silence_s else sample
+
+    q = quat.from_euler(0.15, -0.1, 0.0)
+    _, estimate, (p, v) = _fly(GAINS, 4.1 + silence_s, (0.5, 0.3, 0.1), q=q, thrust=G / 0.985, spoil=silent)
+    assert math.hypot(v[0], v[1]) > 2.5
+    np.testing.assert_allclose(estimate.p_ned_m, p, atol=near_m)
 
 
 def test_a_velocity_that_disagrees_with_the_position_leaves_no_offset():
