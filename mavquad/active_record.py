@@ -6,7 +6,8 @@ What the vehicle acted on is the record's COMMAND (the autopilot's own echo of i
 import math
 
 from mavquad import linalg, quat
-from mavquad.active_flight import GAP_S, Gains
+from mavquad.active_flight import Gains
+from mavquad.active_tick import GAP_S
 from mavquad.estimate import quad_error, record
 from mavquad.jit import kernel
 
@@ -18,32 +19,16 @@ _NAN3 = (math.nan, math.nan, math.nan)
 def run(gains: Gains, events: record.Events) -> record.Observed:
     """The model error at the steps with its bounds, guaranteed while the stated noise and rate bounds hold (`guaranteed`)."""
     out = record.outputs(events)
-    start = quad_error.init(gains.model, _ZERO3, _ZERO3, quad_error.G_M_S2)
     _run(
-        gains.model, start, events.kind, events.t_us, events.x, events.step,
+        gains.model, events.kind, events.t_us, events.x, events.step,
         out.v_ned_m_s, out.f_ned_m_s2, out.low_m_s2, out.high_m_s2, out.guaranteed,
     )  # fmt: skip
     return out
 
 
 @kernel
-def _begun(gains, start, v, attitude, thrust):
-    """The first set, at a measured velocity and attitude."""
-    inner = start.filter
-    z = inner.x.copy()
-    for k in range(3):
-        z[quad_error.V + k] = v[k]
-    z[quad_error.ATT], z[quad_error.ATT + 1] = attitude[0], attitude[1]
-    fresh = quad_error.asmf.State(
-        z, inner.p.copy(), inner.guarantee, inner.clean, inner.empty, inner.inflations, inner.delta, inner.n_bad.copy(),
-        inner.inflated_us.copy(),
-    )  # fmt: skip
-    return quad_error.State(fresh, start.intervals, thrust, attitude, 0.0)
-
-
-@kernel
-def _run(gains, start, kinds, stamps, x, steps, out_v, out_f, low, high, guaranteed):
-    state = start
+def _run(gains, kinds, stamps, x, steps, out_v, out_f, low, high, guaranteed):
+    state = quad_error.init(gains, _ZERO3, _ZERO3, quad_error.G_M_S2)
     last_us, taken_us, attitude_us, velocity_us = 0, 0, 0, 0
     attitude, velocity, accel_sum = _ZERO3, _ZERO3, _ZERO3
     count, accel_us = 0, 0
@@ -69,7 +54,7 @@ def _run(gains, start, kinds, stamps, x, steps, out_v, out_f, low, high, guarant
             row += 1
             continue
         if not begun or not 0.0 < dt_s <= GAP_S:
-            state, taken_us, begun = _begun(gains, start, velocity, attitude, command[2]), t_us, True
+            state, taken_us, begun = quad_error.init(gains, velocity, attitude, command[2]), t_us, True
         else:
             accel, mean_us = _NAN3, t_us
             if count > 0:

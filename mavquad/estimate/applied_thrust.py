@@ -1,68 +1,76 @@
 """Which specific thrust acts on the vehicle at a vehicle time: what was sent, one measured delay ago, behind the rotors' lag.
 
 Where the autopilot echoes its setpoint (ATTITUDE_TARGET) the echo counts instead: 100 ms of delay that nobody measured make
-the vertical disturbance oscillate. The echo is a collective; its scale is learnt against what was sent.
+the vertical disturbance oscillate. The echo is a collective; its scale is learnt against what was sent. Kernels work on an item of a
+record that holds FIELDS.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any
 
-from mavquad.signals import Applied, Target
+import numpy as np
+
+from mavquad.jit import kernel
 
 G_M_S2 = 9.80665
 _REMEMBERED = 64  # setpoints
 _ECHO_US = 150_000  # an echo older than this is not the present thrust
 _SCALE_S = 2.0  # memory of the scale
 
-
-class Thrust(NamedTuple):
-    """What was sent as (vehicle time us, m/s^2), oldest first, and what came back."""
-
-    sent: tuple[tuple[int, float], ...]
-    delay_s: float
-    echoed: float  # newest collective of ATTITUDE_TARGET
-    echo_us: int  # 0: none yet
-    scale: float  # specific thrust per collective; NaN: not known
-
-
-NONE = Thrust((), 0.0, math.nan, 0, math.nan)
+FIELDS = [
+    ("sent_us", "i8", _REMEMBERED),  # a ring of what was sent: vehicle time,
+    ("sent_m_s2", "f8", _REMEMBERED),  # specific thrust
+    ("sent_count", "i8"),  # ever
+    ("delay_s", "f8"),
+    ("echoed", "f8"),  # newest collective of ATTITUDE_TARGET
+    ("echo_us", "i8"),  # 0: none yet
+    ("scale", "f8"),  # specific thrust per collective; NaN: not known
+]
 
 
-def remember(thrust: Thrust, applied: Applied) -> Thrust:
-    """With the setpoint that is in force from applied.t_us on, and the delay as measured now."""
-    size, delay_s = applied.thrust_m_s2, applied.delay_s
-    sent = thrust.sent
-    if math.isfinite(size) and size >= 0.0 and not (sent and sent[-1][0] >= applied.t_us):
-        sent = (*sent[1 - _REMEMBERED :], (applied.t_us, size))
-    if not math.isfinite(delay_s):
-        delay_s = thrust.delay_s
-    return thrust._replace(sent=sent, delay_s=min(1.0, max(0.0, delay_s)))
+def start(record: np.ndarray) -> None:
+    """Nothing sent, nothing echoed."""
+    record["echoed"] = record["scale"] = math.nan
 
 
-def hear(thrust: Thrust, target: Target) -> Thrust:
-    """With the autopilot's echo of the setpoint it acts on."""
-    u = target.thrust
-    if not (math.isfinite(u) and 0.02 < u <= 1.0) or target.t_us <= thrust.echo_us:
-        return thrust
-    scale = thrust.scale
-    if thrust.sent:
-        ratio = sent_at(thrust, target.t_us) / u
-        gap_s = 1e-6 * (target.t_us - thrust.echo_us)
-        scale = ratio if not math.isfinite(scale) else scale + min(0.2, gap_s / _SCALE_S) * (ratio - scale)
-    return thrust._replace(echoed=u, echo_us=target.t_us, scale=scale)
+@kernel
+def remember(s: Any, t_us: int, thrust_m_s2: float, delay_s: float) -> None:
+    """The setpoint that is in force from t_us on, and the delay as measured now."""
+    newer = s.sent_count == 0 or s.sent_us[(s.sent_count - 1) % _REMEMBERED] < t_us
+    if newer and math.isfinite(thrust_m_s2) and thrust_m_s2 >= 0.0:
+        s.sent_us[s.sent_count % _REMEMBERED] = t_us
+        s.sent_m_s2[s.sent_count % _REMEMBERED] = thrust_m_s2
+        s.sent_count += 1
+    if math.isfinite(delay_s):
+        s.delay_s = min(1.0, max(0.0, delay_s))
 
 
-def sent_at(thrust: Thrust, t_us: int) -> float:
+@kernel
+def hear(s: Any, t_us: int, collective: float) -> None:
+    """The autopilot's echo of the setpoint it acts on."""
+    if not (math.isfinite(collective) and 0.02 < collective <= 1.0) or t_us <= s.echo_us:
+        return
+    if s.sent_count > 0:
+        ratio = sent_at(s, t_us) / collective
+        gap_s = 1e-6 * (t_us - s.echo_us)
+        s.scale = ratio if not math.isfinite(s.scale) else s.scale + min(0.2, gap_s / _SCALE_S) * (ratio - s.scale)
+    s.echoed, s.echo_us = collective, t_us
+
+
+@kernel
+def sent_at(s: Any, t_us: int) -> float:
     """The setpoint that has arrived by t, going by the measured delay; gravity before the first."""
-    latest = t_us - round(1e6 * thrust.delay_s)
-    for sent_us, size in reversed(thrust.sent):
-        if sent_us <= latest:
-            return size
+    latest = t_us - round(1e6 * s.delay_s)
+    for k in range(min(s.sent_count, _REMEMBERED)):
+        i = (s.sent_count - 1 - k) % _REMEMBERED
+        if s.sent_us[i] <= latest:
+            return s.sent_m_s2[i]
     return G_M_S2
 
 
-def acting(thrust: Thrust, t_us: int, echo: bool) -> float:
+@kernel
+def acting(s: Any, t_us: int, echo: bool) -> float:
     """Commanded specific thrust at t [m/s^2], before the rotors' lag."""
-    if echo and thrust.echo_us and 0 <= t_us - thrust.echo_us <= _ECHO_US and math.isfinite(thrust.scale):
-        return thrust.scale * thrust.echoed
-    return sent_at(thrust, t_us)
+    if echo and s.echo_us > 0 and 0 <= t_us - s.echo_us <= _ECHO_US and math.isfinite(s.scale):
+        return s.scale * s.echoed
+    return sent_at(s, t_us)

@@ -29,6 +29,7 @@ CLEAN_UPDATES = 50  # that bring the guarantee back
 INFLATED_MARGIN = 1.2
 WINDOW_US = 10_000_000
 HALF_ABOVE, OFF_ABOVE = 5, 20  # enlargements within the window
+_NEVER_US = -(1 << 62)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,19 +95,15 @@ def gains(params: Params, c: np.ndarray) -> Gains:
     )
 
 
+@kernel
 def init(gains: Gains, x: np.ndarray) -> State:
     """A first set around x (n,): half-axes sqrt(p0)."""
-    return State(
-        np.array(x, dtype=float),
-        np.diag(gains.p0),
-        True,
-        CLEAN_UPDATES,
-        0,
-        0,
-        math.nan,
-        np.zeros(gains.e.shape[0], dtype=np.int64),
-        np.full(OFF_ABOVE + 1, np.iinfo(np.int64).min // 2, dtype=np.int64),
-    )
+    n = x.shape[0]
+    p = np.zeros((n, n))
+    for i in range(n):
+        p[i, i] = gains.p0[i]
+    n_bad, inflated_us = np.zeros(gains.e.shape[0], dtype=np.int64), np.full(OFF_ABOVE + 1, _NEVER_US, dtype=np.int64)
+    return State(x.copy(), p, True, CLEAN_UPDATES, 0, 0, math.nan, n_bad, inflated_us)
 
 
 @kernel

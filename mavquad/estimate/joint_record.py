@@ -6,8 +6,9 @@ The thrust that acts is the record's COMMAND, which here stands for what was sen
 import math
 
 from mavquad import quat
-from mavquad.estimate import applied_thrust, ekf, joint_flight, record
-from mavquad.estimate.joint_flight import Axes, Gains
+from mavquad.estimate import applied_thrust, ekf, joint_tick, record
+from mavquad.estimate.joint_flight import Gains
+from mavquad.estimate.joint_tick import Axes
 from mavquad.jit import kernel
 from mavquad.linalg import axpy
 
@@ -21,7 +22,7 @@ _ZERO3 = (0.0, 0.0, 0.0)
 def run(gains: Gains, events: record.Events) -> record.Observed:
     """What the observer estimates at the steps; gains of `joint_flight` or `leso_flight`."""
     out = record.outputs(events)
-    start = joint_flight.init(gains).ekf
+    start = ekf.init(gains.ekf, ekf.NOTHING)
     _run(gains, start, events.kind, events.t_us, events.x, events.step, out.p_ned_m, out.v_ned_m_s, out.f_ned_m_s2)
     return out
 
@@ -40,7 +41,7 @@ def _to(gains, state, axes, axes_us, thrust, fast, placed, wanted, now_us, t_us)
         q = quat.integrate(state.q_wxyz, state.omega_rad_s, dt_s)
         turned = ekf.EkfState(state.p_ned_m, state.v_ned_m_s, q, state.omega_rad_s, state.P, state.singular)
         return turned, axes, t_us, now, t_us
-    moved, ahead = joint_flight.carry(gains.ekf, state, axes, mean, fast, gains.use_filter, dt_s)
+    moved, ahead = joint_tick.carry(gains.ekf, state, axes, mean, fast, gains.use_filter, dt_s)
     return moved, ahead, axes_us, now, t_us
 
 
@@ -142,7 +143,7 @@ def _run(gains, state, kinds, stamps, x, steps, out_p, out_v, out_f):
 def _position(gains, state, axes, thrust, fast, offset, p, v, age_s, since_s, since_axes_us):
     """A position sample absorbed: (filter, observers, offset)."""
     speed = state.v_ned_m_s if gains.use_filter else axpy(1.0, axes.gained_m_s, axes.z2)
-    known = joint_flight.known(gains.ekf, state.q_wxyz, thrust, speed)
+    known = joint_tick.known(gains.ekf, state.q_wxyz, thrust, speed)
     a = axpy(1.0, known, axpy(1.0, axes.z3, fast))
     p = axpy(age_s, speed, p)
     v = axpy(age_s, a, v)
@@ -155,14 +156,14 @@ def _position(gains, state, axes, thrust, fast, offset, p, v, age_s, since_s, si
             miss = axpy(-1.0, state.p_ned_m, p)
             offset = axpy(w, axpy(-1.0, offset, miss), offset)
     dt_s = max(1e-3, 1e-6 * since_axes_us)
-    return state, joint_flight.observed(axes, y, gains.w0, gains.tau_f_s, gains.butterworth, dt_s), offset
+    return state, joint_tick.observed(axes, y, gains.w0, gains.tau_f_s, gains.butterworth, dt_s), offset
 
 
 @kernel
 def _felt(gains, state, thrust, fast, accel, since_s):
     """The accelerometer's part of the disturbance after a sample."""
     felt = axpy(1.0, quat.rotate(state.q_wxyz, accel), (0.0, 0.0, gains.ekf.gravity_m_s2))
-    rest = axpy(-1.0, joint_flight.known(gains.ekf, state.q_wxyz, thrust, state.v_ned_m_s), felt)
+    rest = axpy(-1.0, joint_tick.known(gains.ekf, state.q_wxyz, thrust, state.v_ned_m_s), felt)
     w = 1.0 - math.exp(-since_s / gains.accel_tau_s)
     return axpy(w, axpy(-1.0, fast, rest), fast)
 
@@ -175,5 +176,5 @@ def _read(gains, state, axes, since_s, fast, offset):
     else:
         p = axpy(1.0, axpy(0.5 * since_s * since_s, axes.z3, axes.moved_m), axpy(since_s, axes.z2, axes.z1))
         v = axpy(1.0, axpy(since_s, axes.z3, axes.gained_m_s), axes.z2)
-    f = joint_flight.compensated(axes, gains.w0, gains.feedforward, gains.lead_s, gains.butterworth)
+    f = joint_tick.compensated(axes, gains.w0, gains.feedforward, gains.lead_s, gains.butterworth)
     return p, v, axpy(-gains.ekf.drag_1_s, v, axpy(1.0, f, fast))

@@ -23,7 +23,6 @@ from mavquad.estimate import asmf, interval
 from mavquad.jit import kernel
 
 Vec3 = tuple[float, float, float]
-Cuts = tuple[interval.Cut, interval.Cut, interval.Cut]
 
 G_M_S2 = 9.80665
 N_STATES, N_OUTPUTS = 10, 8
@@ -97,12 +96,15 @@ def gains(params: Params) -> Gains:
     )
 
 
+@kernel
 def init(gains: Gains, velocity_ned_m_s: Vec3, attitude_rad: Vec3, thrust_m_s2: float) -> State:
     """Start at a measured velocity and attitude, thrust as commanded."""
     x = np.zeros(N_STATES)
-    x[V : V + 3] = velocity_ned_m_s
-    x[ATT : ATT + 2] = attitude_rad[:2]
-    unknown = interval.init()
+    for i in range(3):
+        x[V + i] = velocity_ned_m_s[i]
+    for i in range(2):
+        x[ATT + i] = attitude_rad[i]
+    unknown = interval.State(-math.inf, math.inf, 0, 0)
     return State(asmf.init(gains.filter, x), (unknown, unknown, unknown), thrust_m_s2, attitude_rad, 0.0)
 
 
@@ -221,18 +223,3 @@ def bounds_f(state: State, axis: int) -> interval.Cut:
     centre, half = state.filter.x[F + axis], math.sqrt(max(state.filter.p[F + axis, F + axis], 0.0))
     seen = state.intervals[axis]
     return interval.cut(seen.low, seen.high, centre - half, centre + half)
-
-
-@kernel
-def bounds(state: State) -> Cuts:
-    """The published intervals of f on all three axes."""
-    return bounds_f(state, 0), bounds_f(state, 1), bounds_f(state, 2)
-
-
-@kernel
-def judged_step(
-    gains: Gains, state: State, command: Vec3, measured: Measured, dt_s: float, t_us: int
-) -> tuple[State, Cuts, float]:
-    """`step`, with what is read after it: the published intervals, and the authority the filter leaves to a correction."""
-    state = step(gains, state, command, measured, dt_s, t_us)
-    return state, bounds(state), asmf.authority(state.filter, t_us)

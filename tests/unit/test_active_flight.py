@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from mavquad import active_flight, airframe, quat
+from mavquad import active_flight, active_tick, airframe, quat
 from mavquad.compensate import active_model
 from mavquad.errors import ConfigError
 from mavquad.estimate import quad_error
@@ -122,7 +122,7 @@ def test_a_wound_up_integral_takes_over_only_as_far_as_the_bounds_believe_it():
     loop.gains = loop.gains._replace(authority=0.0)
     loop.run(1.0)
     assert loop.rows[-1]["authority"] == 0.0
-    assert abs(loop.command.f_cancelled_m_s2[0] - high) < active_flight.WOUND_UP_M_S2 + 0.6
+    assert abs(loop.command.f_cancelled_m_s2[0] - high) < active_tick.WOUND_UP_M_S2 + 0.6
 
 
 def test_a_lost_accelerometer_widens_the_bounds_and_softens_the_correction():

@@ -57,13 +57,13 @@ def _flown(module, gains, samples, events):
     for sample, asked in _at_steps(samples, events):
         if isinstance(sample, Target):  # what was sent, with no delay: the record's commands
             applied = Applied(sample.t_us, sample.q_wxyz, G * sample.thrust / HOVER, NAN3, 0.0)
-            thrust = state.thrust if hasattr(state, "thrust") else None
-            if thrust is None:
+            if module is extended_state_flight:
                 state = state._replace(
                     sent=(*state.sent[-63:], extended_state_flight.Sent(sample.t_us, applied.thrust_m_s2, sample.thrust))
                 )
             else:
-                state = state._replace(thrust=joint_flight.applied_thrust.remember(thrust, applied))
+                state = state.copy()
+                joint_flight.applied_thrust.remember(state[0], applied.t_us, applied.thrust_m_s2, applied.delay_s)
         else:
             state = module.observe(gains, state, sample)
         if asked:
