@@ -1,4 +1,4 @@
-"""The one numba decorator, `@kernel`.
+"""The numba decorator, `@kernel` (for threads: `@kernel_for_threads`).
 
 Kernels are scalar Python: short vectors as tuples of floats, arrays for matrices, NamedTuples for state. The same source
 runs uncompiled with NUMBA_DISABLE_JIT=1, the only environment variable read below a shell.
@@ -93,9 +93,18 @@ def _folder(module: str) -> str:
 
 def kernel(function: _F) -> _F:
     """Compile a scalar function: cached, numpy's error model (x/0 is inf, never an exception), no fastmath."""
+    return _compiled(function, nogil=False)
+
+
+def kernel_for_threads(function: _F) -> _F:
+    """`kernel`, and other threads of Python run beside it: for work of milliseconds, which a thread does for a part of the data."""
+    return _compiled(function, nogil=True)
+
+
+def _compiled(function: _F, nogil: bool) -> _F:
     if not COMPILED:
         return function
     import numba  # half a second: only where a kernel is
 
     numba.config.CACHE_DIR = _folder(function.__module__)  # type: ignore[attr-defined]  # read by njit where it decorates
-    return cast(_F, numba.njit(cache=True, error_model="numpy")(function))
+    return cast(_F, numba.njit(cache=True, error_model="numpy", nogil=nogil)(function))

@@ -11,7 +11,7 @@ from sitl.sensors import COLUMNS, sense
 from sitl.state import VEHICLE, Record
 from tools import scenarios
 from tools.__main__ import main
-from tools.bulk import lean, normals, setup, stepwise
+from tools.bulk import fleet, lean, normals, rates, setup, stepwise
 from tools.bulk.state import FLYING, LOST, NOISE, TOUCHED, TRACE
 from tools.campaigns import compiled, grid
 
@@ -112,6 +112,22 @@ def test_the_same_seed_is_the_same_flight_in_one_call_or_in_many():
         assert p.flight["t_us"] >= p.end_us
         ends.append(p.flight.array.tobytes())
     assert ends[0] == ends[1] != ends[2]
+
+
+def test_each_vehicle_of_a_fleet_moves_as_it_would_alone():
+    flights = [setup.prepare(resolve("gusty", f"wind.mean_m_s={0.2 * seed}", seed=seed, controller="pid")) for seed in range(1, 36)]
+    for p in flights:
+        setup.fly(p, setup.START_US + 2_500_000)  # setpoints flow
+    together = fleet.gather(flights)  # a part and three vehicles more
+    for steps in (1, 400):
+        fleet.advance(together, steps, threads=2)
+        for p in flights:
+            v = p.vehicle
+            rates.with_loops(v.state.array, v.setpoint.array, v.constants.array, v._gusts, p.noise.array, steps)
+    alone = [p.vehicle.state.array.tobytes() for p in flights]
+    assert [together.vehicles[k : k + 1].tobytes() for k in range(35)] == alone
+    assert len(set(alone)) == 35
+    assert np.ptp(together.vehicles["p_ned_m"][:, 0]) > 0.01
 
 
 def test_scores_are_those_of_a_flight_step_by_step():

@@ -20,6 +20,7 @@ from tools.benches import Row
 from tools.bulk import setup
 
 _OURS = "17 states (rotation matrix, 4 rotor lags), midpoint 2 ms, drag, Dryden wind"
+_CONTROLLED = f"{_OURS}, wind held, attitude and rate loops on the truth, 500 Hz"
 _C_SOURCE = r"""
 #include <math.h>
 #include <stdio.h>
@@ -83,7 +84,7 @@ print(json.dumps(n / (time.process_time() - t)))
 
 def measure(seconds: float) -> list[Row]:
     """Ours from the bare rigid body to whole flights, then the others."""
-    rows = [*_single(seconds), _many(seconds), _limit(), _rotorpy()]
+    rows = [*_single(seconds), _fleet(seconds), _many(seconds), _limit(), _rotorpy()]
     ours, theirs = rows[1].value, rows[-1].value
     if math.isfinite(theirs):
         rows.append(
@@ -110,7 +111,7 @@ def _single(seconds: float) -> list[Row]:
         ("rigid-body step", f"{_OURS}, wind held", kernels.plant_alone),
         (
             "plant + attitude control, one vehicle",
-            f"{_OURS}, wind held, attitude and rate loops on the truth, 500 Hz",
+            _CONTROLLED,
             kernels.with_loops,
         ),
         (
@@ -136,6 +137,28 @@ def _single(seconds: float) -> list[Row]:
     n = (p.flight["t_us"] - setup.START_US) / p.flight["step_us"]
     physics = f"{_OURS}; all of the above, link delay, pid at 125 Hz, setpoint gate"
     return [*rows, Row("whole flight, one vehicle", "ours, one core", 1e-6 * n / best, "M steps/s", physics)]
+
+
+def _fleet(seconds: float) -> Row:
+    """1000 vehicles, each of a seed of its own, moved on by one call over all cores."""
+    from tools.bulk import fleet
+
+    flights, steps = 1000, max(200, round(200 * seconds))
+    prepared = [setup.prepare(_resolved(1.0, seed)) for seed in range(1, flights + 1)]
+    for p in prepared:
+        setup.fly(p, setup.START_US + 3_000_000)
+    vehicles, best = fleet.gather(prepared), math.inf
+    for i in range(6):
+        begun = time.perf_counter()
+        fleet.advance(vehicles, steps if i else 1)
+        best = min(best, time.perf_counter() - begun) if i else best
+    return Row(
+        f"{flights} flights in one call, plant + attitude and rate loops",
+        f"ours, {os.cpu_count()} cores",
+        1e-6 * flights * steps / best,
+        "M steps/s",
+        f"{_CONTROLLED}; wanted: 6 on 2 cores",
+    )
 
 
 def _many(seconds: float) -> Row:

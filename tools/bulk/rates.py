@@ -15,16 +15,22 @@ def plant_alone(vehicle, setpoint, constants, gusts, noise, steps):
 
 
 @kernel
+def step_on_truth(s, sp, c):
+    """One step of attitude and rate loops that know the truth, and of the plant under their outputs."""
+    for i in range(9):
+        s.ahrs_R[i] = s.R[i]
+    for i in range(3):
+        s.rates_rad_s[i] = s.omega_rad_s[i]
+    loops.run(s, sp, c)
+    plant.step(s, c)
+
+
+@kernel
 def with_loops(vehicle, setpoint, constants, gusts, noise, steps):
     """The rigid body under the autopilot's loops, which know the truth."""
     s, sp, c = vehicle[0], setpoint[0], constants[0]
     for _ in range(steps):
-        for i in range(9):
-            s.ahrs_R[i] = s.R[i]
-        for i in range(3):
-            s.rates_rad_s[i] = s.omega_rad_s[i]
-        loops.run(s, sp, c)
-        plant.step(s, c)
+        step_on_truth(s, sp, c)
 
 
 @kernel
