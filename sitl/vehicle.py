@@ -85,8 +85,7 @@ class Vehicle:
         self.setpoint = Record(SETPOINT)
         self.state = Record(VEHICLE)
         self._gusts = wind.gust_table(sitl.wind.gusts)
-        self._generators = self._seeded(sitl.seed)
-        self._normals = np.zeros((_BLOCK, sensors.COLUMNS))
+        self._generators, self._normals = self._noise(sitl.seed)
         self._fill_body(sitl, true)
         self._fill_sensors(sitl)
         self._fill_air(sitl, true)
@@ -112,8 +111,10 @@ class Vehicle:
         """That many steps, which the normals drawn last for."""
         advance(self.state.array, self.setpoint.array, self.constants.array, self._gusts, self._normals, steps)
 
-    def _seeded(self, seed: int) -> list[np.random.Generator]:
-        return [np.random.default_rng([seed, 1 + i]) for i in range(len(_GENERATORS))]
+    def _noise(self, seed: int) -> tuple[list[np.random.Generator], np.ndarray]:
+        """The generators, and room for what is drawn at once."""
+        generators = [np.random.default_rng([seed, 1 + i]) for i in range(len(_GENERATORS))]
+        return generators, np.zeros((_BLOCK, sensors.COLUMNS))
 
     def _draw(self) -> None:
         self._left = _BLOCK

@@ -115,7 +115,9 @@ def test_the_same_seed_is_the_same_flight_in_one_call_or_in_many():
 
 
 def test_each_vehicle_of_a_fleet_moves_as_it_would_alone():
-    flights = [setup.prepare(resolve("gusty", f"wind.mean_m_s={0.2 * seed}", seed=seed, controller="pid")) for seed in range(1, 36)]
+    flights = [
+        setup.prepare(resolve("gusty", f"wind.mean_m_s={0.2 * seed}", seed=seed, controller="pid")) for seed in range(1, 36)
+    ]
     for p in flights:
         setup.fly(p, setup.START_US + 2_500_000)  # setpoints flow
     together = fleet.gather(flights)  # a part and three vehicles more

@@ -44,8 +44,8 @@ class Prepared(NamedTuple):
 class _Undrawn(Vehicle):
     """A vehicle whose noise is drawn step by step inside the compiled flight."""
 
-    def _seeded(self, seed: int) -> list[np.random.Generator]:
-        return [np.random.default_rng([seed, 1 + i]) for i in DRAWN]
+    def _noise(self, seed: int) -> tuple[list[np.random.Generator], np.ndarray]:
+        return [np.random.default_rng([seed, 1 + i]) for i in DRAWN], np.zeros((0, 0))
 
     def _draw(self) -> None:
         self._left = 0
