@@ -21,7 +21,7 @@ class Params:
 
     wc_rad_s: float = 0.0
     drag_feed_forward: float = 1.0
-    tilt_max_deg: float = 35.0
+    tilt_max_deg: float = 39.0  # below the gate's 40: less is lost upwind
     loop: str = "attitude"
 
     def __post_init__(self) -> None:

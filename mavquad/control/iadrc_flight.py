@@ -42,7 +42,7 @@ class Params:
     predict: bool = True
     jerk_feed_forward: float = 1.0
     drag_feed_forward: float = 1.0
-    tilt_max_deg: float = 35.0
+    tilt_max_deg: float = 39.0  # below the gate's 40: less is lost upwind
     f_max_m_s2: float = 8.0
     delay_max_s: float = 0.4
     loop: str = "attitude"  # rates: the attitude loop is closed here too, and body rates are sent
