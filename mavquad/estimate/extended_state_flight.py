@@ -33,8 +33,11 @@ _LATE_S = 0.25  # a position older than the filter by more is not used
 _COAST_S = 1.5  # the longest silence that is integrated over; beyond it the filter begins again where it is
 _ECHO_S = 0.3  # an echo older than this is not the present thrust
 _SAME = 1e-6  # collectives this near are one: a float's rounding
-_JUDGE = 0.05  # how quickly the growth of f follows the innovations, per sample
-_CALM = -0.06  # product of two vertical innovations over their variance: -0.15 in calm air, -0.05 to 0.06 in gusts
+_JUDGE = 0.04  # how quickly the growth of f follows the innovations, per sample
+_KEPT = 0.7  # of the sum of past innovations that a new one is compared with, per sample: one alone says half as much
+_TREND = math.sqrt(1.0 - _KEPT**2)  # the sum varies like one innovation
+# vertical innovation times that sum over its variance, at a share of 0.1 and 0.5: -0.14 and -0.17 in calm air, 0.4 to 1.2 and 0 to 0.16 in gusts
+_CALM = -0.06
 _MEAN = 0.02  # weight of an innovation in their mean: what telemetry's inconsistency leaves is no gust
 _SCALE_S = 1.0  # memory of the scale between echoed and specific thrust
 
@@ -47,7 +50,7 @@ class Params:
     velocity_sigma_m_s: float = 0.03
     f_growth: float = 0.02
     f_growth_down: float = 0.02
-    f_growth_least: float = 0.1  # share of it that is left in calm air, as the innovations say; 1: it stays as it is
+    f_growth_least: float = 0.03  # share of it that is left in calm air, as the innovations say; 1: it stays as it is
     adapt: float = 0.0  # weight of a new residual in R (0: R stays)
     anchor_s: float = 1.5  # time constant of the raw position's slow part (0: off)
     drag: float = 1.0  # share of the airframe file's drag taken as known
@@ -73,7 +76,7 @@ class Growth(NamedTuple):
     """The share of the growth of f that the filter believes in, and what it is judged by: innovations of velocity."""
 
     share: float
-    last: Vec3  # the newest, less their mean
+    trend: Vec3  # the newest less their mean, summed with a memory of _KEPT
     mean: Vec3
 
 
@@ -218,17 +221,18 @@ def correct(
 
 @kernel
 def _judged(least: float, growth: Growth, e: Vec3, expected: Vec3) -> Growth:
-    """Vertical innovations of changing sign: the filter follows mere noise, the air is calm. One like the other: it is not.
+    """Vertical innovations against those before: the filter follows mere noise, the air is calm. Like those before: it is not.
 
     Gusts along the ground are slower: only strong ones show.
     """
     m = growth.mean
     m = (m[0] + _MEAN * (e[0] - m[0]), m[1] + _MEAN * (e[1] - m[1]), m[2] + _MEAN * (e[2] - m[2]))
     now = (e[0] - m[0], e[1] - m[1], e[2] - m[2])
-    last = growth.last
-    level = max(now[0] * last[0] / expected[0], now[1] * last[1] / expected[1])
-    drive = now[2] * last[2] / expected[2] - _CALM + max(0.0, level - 4.0)
-    return Growth(min(1.0, max(least, growth.share * math.exp(_JUDGE * min(10.0, drive)))), now, m)
+    t = growth.trend
+    level = max(now[0] * t[0] / expected[0], now[1] * t[1] / expected[1])
+    drive = now[2] * t[2] / expected[2] - _CALM + max(0.0, level - 4.0)
+    t = (_KEPT * t[0] + _TREND * now[0], _KEPT * t[1] + _TREND * now[1], _KEPT * t[2] + _TREND * now[2])
+    return Growth(min(1.0, max(least, growth.share * math.exp(_JUDGE * min(10.0, drive)))), t, m)
 
 
 def observe(gains: Gains, state: State, sample: object) -> State:

@@ -114,7 +114,7 @@ def test_an_echo_says_which_of_our_setpoints_acts():
     assert stamps == sorted(stamps)
 
 
-def _share(gust_m_s2, jolt_m_s2=0.0, least=0.1, seed=3):
+def _share(gust_m_s2, jolt_m_s2=0.0, least=0.03, seed=3):
     """The share of the growth after a minute of hover in vertical gusts (memory 0.35 s), with one jolt to the north at its end."""
     gains, rng = flight.gains(flight.Params(f_growth_least=least), FRAME), np.random.default_rng(seed)
     state, p, v, f = flight.init(gains), np.zeros(3), np.zeros(3), np.zeros(3)
@@ -133,9 +133,10 @@ def _share(gust_m_s2, jolt_m_s2=0.0, least=0.1, seed=3):
 
 
 def test_in_calm_air_the_filter_follows_less_of_the_noise():
-    assert _share(0.0) < 0.4
-    assert _share(1.2) > 0.8
-    assert _share(0.0, jolt_m_s2=6.0) > 2.0 * _share(0.0)  # a gust along the ground wakes it within 0.4 s
+    calm = [_share(0.0, seed=seed) for seed in (3, 4)]
+    assert max(calm) < 0.08
+    assert min(_share(1.2, seed=seed) for seed in (3, 4)) > 0.7
+    assert _share(0.0, jolt_m_s2=6.0) > 2.0 * calm[0]  # a gust along the ground wakes it within 0.4 s
     assert _share(0.0, least=1.0) == 1.0  # off
     with pytest.raises(ConfigError, match="f_growth_least"):
         flight.Params(f_growth_least=0.0)
