@@ -82,7 +82,12 @@ def quiet_half_width(model):
 @kernel
 def followed(state, echo_us, q_wxyz):
     """Whether the autopilot's echo is close to what was sent shortly before."""
-    s = state[0]
+    return follows(state[0], echo_us, q_wxyz)
+
+
+@kernel
+def follows(s, echo_us, q_wxyz):
+    """`followed` on a record's item."""
     roll, pitch, _ = quat.to_euler(q_wxyz)
     for i in range(_LINE):
         if not 0 <= echo_us - s.line_us[i] <= 1e6 * ECHO_S:
@@ -157,7 +162,7 @@ def advance(g, correction, own, s, t_us, active, applied, heard, nominal):
         a, cancelled = _correct(correction, own, s, nominal, t_us, 0.0 if begin else dt_s)
     else:
         s.authority = 0.0
-        _put3(s.given_back_m_s2, _ZERO3)
+        flat.put3(s.given_back_m_s2, _ZERO3)
     _show(s)
     return a, cancelled
 
@@ -210,19 +215,14 @@ def _correct(correction, own, s, nominal, t_us, dt_s):
     given_back = linalg.sub(own_f, believed)
     a = active_model.correct(correction, linalg.add(wanted, given_back), yaw_rad, f, (s.x[8], s.x[9]), authority)
     s.authority = authority
-    _put3(s.f_ned_m_s2, f)
-    _put3(s.given_back_m_s2, given_back)
+    flat.put3(s.f_ned_m_s2, f)
+    flat.put3(s.given_back_m_s2, given_back)
     return a, linalg.axpy(authority, f, believed)
 
 
 @kernel
 def _half_width(p):
     return math.sqrt(max(p[3, 3], p[4, 4], p[5, 5], 0.0))
-
-
-@kernel
-def _put3(to, v):
-    to[0], to[1], to[2] = v[0], v[1], v[2]
 
 
 @kernel
@@ -254,7 +254,7 @@ def _keep(s, model):
     s.n_bad[:] = inner.n_bad
     s.inflated_us[:] = inner.inflated_us
     s.thrust_m_s2, s.slew_m_s3 = model.thrust_m_s2, model.slew_m_s3
-    _put3(s.attitude_rad, model.attitude_rad)
+    flat.put3(s.attitude_rad, model.attitude_rad)
     for i in range(3):
         seen, cut = model.intervals[i], quad_error.bounds_f(model, i)
         s.interval[i, 0], s.interval[i, 1], s.interval_n_bad[i], s.interval_empty[i] = (

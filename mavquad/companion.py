@@ -16,7 +16,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from mavquad import lifecycle, pipeline, relay, wire
+from mavquad import lifecycle, pipeline, position_age, relay, wire
 from mavquad.errors import FlightError
 from mavquad.lifecycle import Life
 from mavquad.link import clock, health
@@ -405,7 +405,7 @@ class Companion:
             "interventions": self.flight.interventions,
             "hover_thrust": self.flight.hover_thrust,
             "delay_s": self.flight.delay_s,
-            "position_age_s": self.flight.position_age.age_s,
+            "position_age_s": position_age.age_s(self.flight.position_age),
             "controller": diagnose(self.flight.controller) if diagnose else {},
             "rates_hz": {r.name: r.granted_hz for r in life.rates},
             "observer_samples": {

@@ -55,7 +55,7 @@ def step(plan: Plan, f: Flight, t_us: int, dt_s: float) -> None:
             gains, f.controller, estimate, demand, lambda t: demand_at(plan, f, t), dt_s
         )
         command = nominal
-        if hasattr(plan.controller.module, "messages"):  # a controller with something to say beside its setpoint
+        if "messages" in vars(plan.controller.module):  # a controller with something to say beside its setpoint
             said = plan.controller.module.messages(plan.controller.gains, before, f.controller, t_us, f.life.target)
             outbox.send_all(plan, f, said)
     if plan.compensator is not None:
@@ -64,7 +64,7 @@ def step(plan: Plan, f: Flight, t_us: int, dt_s: float) -> None:
         )
         if active:
             command = corrected
-            if hasattr(plan.controller.module, "track"):  # its integral must not wind up behind what cancels in its place
+            if "track" in vars(plan.controller.module):  # its integral must not wind up behind what cancels in its place
                 f.controller = plan.controller.module.track(gains, f.controller, estimate, command.f_cancelled_m_s2)
     bits = 0
     if active:
@@ -82,10 +82,9 @@ def step(plan: Plan, f: Flight, t_us: int, dt_s: float) -> None:
 def _setpoint(plan: Plan, f: Flight, command: Command) -> Setpoint:
     """Attitude and collective from the wanted acceleration."""
     gains = plan.limits
-    thrust = attitude.thrust_vector(command.a_ned_m_s2, gains.tilt_rad, 0.2 * G_M_S2, 1.8 * G_M_S2)
-    q, size = attitude.attitude(thrust, command.yaw_rad)
+    q, size, upward = attitude.pointing(command.a_ned_m_s2, command.yaw_rad, gains.tilt_rad)
     # ArduCopter multiplies by 1/cos(tilt) itself: it gets the vertical part only
-    specific = thrust[2] if f.life.autopilot == lifecycle.ARDUPILOT else size
+    specific = upward if f.life.autopilot == lifecycle.ARDUPILOT else size
     omega, mask = ZERO3, 7
     if math.isfinite(command.omega_rad_s[0]):
         omega = command.omega_rad_s

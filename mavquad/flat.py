@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from mavquad.jit import kernel
+
 _LEFT_OUT = (str, type(None))
 
 
@@ -50,3 +52,15 @@ def _kind(value: Any) -> tuple[Any, ...]:
         a.dtype.kind
     ]  # numba knows no arrays of flags inside of records
     return (code, a.shape) if a.shape else (code,)
+
+
+@kernel
+def vec3(a):
+    """Three numbers of a record's field as a tuple."""
+    return (a[0], a[1], a[2])
+
+
+@kernel
+def put3(to, v):
+    """A vector into a record's field."""
+    to[0], to[1], to[2] = v[0], v[1], v[2]

@@ -4,6 +4,8 @@ import difflib
 import math
 from typing import Any
 
+import numpy as np
+
 from mavquad import following, lifecycle, position_age, wire
 from mavquad.errors import ConfigError
 from mavquad.lifecycle import Life
@@ -42,7 +44,7 @@ class Flight:
     q_wxyz: Quat  # newest attitude
     position: Position | None
     told: tuple[Vec3, Vec3] | None  # position and velocity as last sent
-    position_age: position_age.State  # how far behind its stamp it is
+    position_age: np.ndarray  # record of `position_age`: how far behind its stamp it is
     offset_m: Vec3  # subtracted from every position: the sum of the autopilot's own resets
     origin_m: Vec3  # where the vehicle was armed
     estimate: Estimate | None

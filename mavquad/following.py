@@ -7,6 +7,9 @@ loops leave between the two is small and short, in gusts too; where they part by
 import math
 from typing import NamedTuple
 
+import numpy as np
+
+from mavquad import flat
 from mavquad.airframe import AttitudeResponse
 from mavquad.jit import kernel
 from mavquad.signals import Quat
@@ -21,20 +24,40 @@ _RULE_RAD, _RULE_S = (
     8.0,
 )  # what they part by as a rule, before anything is known and over how long it is learnt
 _KEPT_US = 400_000
+_RING = 512  # setpoints kept: 400 ms at 1 kHz
+
+RECORD = flat.record(
+    [
+        ("sent_us", "i8", _RING),  # a ring of what was sent: vehicle time,
+        ("sent", "f8", (_RING, 2)),  # thrust axis north and east
+        ("sent_count", "i8"),  # ever
+        ("axis", "f8", 2),  # expected
+        ("rate", "f8", 2),
+        ("t_us", "i8"),
+        ("rule_rad", "f8"),  # root mean square of what they part by
+        ("apart_s", "f8"),  # weighed by how far
+        ("together_s", "f8"),
+    ]
+)
 
 
 class State(NamedTuple):
-    sent: tuple[tuple[int, float, float], ...]  # vehicle time, thrust axis north and east
-    axis: tuple[float, float]  # expected
-    rate: tuple[float, float]
-    t_us: int
-    rule_rad: float  # root mean square of what they part by
-    apart_s: float  # weighed by how far
-    together_s: float
     follows: bool
+    record: np.ndarray  # (1,)
+
+    @property
+    def apart_s(self) -> float:
+        """For how long they have been apart, weighed by how far."""
+        return float(self.record["apart_s"][0])
 
 
-START = State((), (0.0, 0.0), (0.0, 0.0), 0, _RULE_RAD, 0.0, 0.0, True)
+def _start() -> State:
+    record = np.zeros(1, RECORD)
+    record["rule_rad"] = _RULE_RAD
+    return State(True, record)
+
+
+START = _start()
 
 
 @kernel
@@ -62,26 +85,59 @@ def answer(
 
 def step(response: AttitudeResponse, state: State, t_us: int, sent: Quat, measured: Quat, delay_s: float) -> State:
     """After a control step at t_us that sent an attitude; delay_s from here to the autopilot and back into telemetry."""
-    now = axis(measured)
-    dt_s = 1e-6 * (t_us - state.t_us)
-    if not state.t_us or not 0.0 < dt_s < 0.5:  # the beginning, or a gap: nothing is known of what happened in it
-        return START._replace(sent=((t_us, *axis(sent)),), axis=now, t_us=t_us, rule_rad=state.rule_rad, follows=state.follows)
-    acts_us = t_us - round(1e6 * (response.delay_s + delay_s))
-    old = 0
-    while old < len(state.sent) and state.sent[old][0] <= t_us - _KEPT_US:
-        old += 1
-    kept = (*state.sent[old:], (t_us, *axis(sent)))
-    acting = next((entry for entry in reversed(kept) if entry[0] <= acts_us), kept[0])
-    x, v = answer(response.natural_frequency_rad_s, response.damping, state.axis, state.rate, acting[1:], dt_s)
+    own = (response.natural_frequency_rad_s, response.damping, response.delay_s)
+    return State(*_step(state.record, state.follows, own, t_us, sent, measured, delay_s))
+
+
+@kernel
+def _step(state, follows, response, t_us, sent, measured, delay_s):
+    out = np.empty_like(state)
+    out[0] = state[0]
+    s = out[0]
+    now, wanted = axis(measured), axis(sent)
+    dt_s = 1e-6 * (t_us - s.t_us)
+    if s.t_us == 0 or not 0.0 < dt_s < 0.5:  # the beginning, or a gap: nothing is known of what happened in it
+        s.sent_count, s.apart_s, s.together_s = 0, 0.0, 0.0
+        _send(s, t_us, wanted)
+        s.axis[0], s.axis[1], s.rate[0], s.rate[1], s.t_us = now[0], now[1], 0.0, 0.0, t_us
+        return follows, out
+    _send(s, t_us, wanted)
+    natural_rad_s, damping, own_delay_s = response
+    x, v = answer(
+        natural_rad_s, damping, (s.axis[0], s.axis[1]), (s.rate[0], s.rate[1]), _acting(s, t_us, own_delay_s + delay_s), dt_s
+    )
     apart = math.hypot(now[0] - x[0], now[1] - x[1])
     lean = max(math.hypot(x[0], x[1]), math.hypot(now[0], now[1]))
-    most = max(LEAST_RAD, MANY * state.rule_rad, SHARE * lean, delay_s * math.hypot(v[0], v[1]))
-    rule = math.sqrt(state.rule_rad**2 + dt_s / _RULE_S * (min(apart, most) ** 2 - state.rule_rad**2))
-    apart_s = max(0.0, state.apart_s + dt_s * (min(apart / most, 4.0) - 1.0))
-    together_s = state.together_s + dt_s if apart <= most else 0.0
-    follows = state.follows
-    if together_s > AGAIN_S:
-        follows, apart_s = True, 0.0
-    elif apart_s > FOR_S + delay_s:
+    most = max(LEAST_RAD, MANY * s.rule_rad, SHARE * lean, delay_s * math.hypot(v[0], v[1]))
+    s.rule_rad = math.sqrt(s.rule_rad**2 + dt_s / _RULE_S * (min(apart, most) ** 2 - s.rule_rad**2))
+    s.apart_s = max(0.0, s.apart_s + dt_s * (min(apart / most, 4.0) - 1.0))
+    s.together_s = s.together_s + dt_s if apart <= most else 0.0
+    if s.together_s > AGAIN_S:
+        follows, s.apart_s = True, 0.0
+    elif s.apart_s > FOR_S + delay_s:
         follows = False
-    return State(kept, x, v, t_us, rule, apart_s, together_s, follows)
+    s.axis[0], s.axis[1], s.rate[0], s.rate[1], s.t_us = x[0], x[1], v[0], v[1], t_us
+    return follows, out
+
+
+@kernel
+def _send(s, t_us, wanted):
+    i = s.sent_count % _RING
+    s.sent_us[i], s.sent[i, 0], s.sent[i, 1] = t_us, wanted[0], wanted[1]
+    s.sent_count += 1
+
+
+@kernel
+def _acting(s, t_us, delay_s):
+    """The thrust axis sent that acts now, of those of the last moments: the newest old enough, else the oldest."""
+    acts_us = t_us - round(1e6 * delay_s)
+    newest = s.sent_count - 1
+    oldest = newest
+    for k in range(min(s.sent_count, _RING)):
+        i = (newest - k) % _RING
+        if k > 0 and s.sent_us[i] <= t_us - _KEPT_US:
+            break
+        oldest = i
+        if s.sent_us[i] <= acts_us:
+            return (s.sent[i, 0], s.sent[i, 1])
+    return (s.sent[oldest % _RING, 0], s.sent[oldest % _RING, 1])

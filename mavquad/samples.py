@@ -107,7 +107,8 @@ def _pace(f: Flight) -> None:
 def _punctual(plan: Plan, f: Flight, t_us: int) -> None:
     """Our own lateness: arrival against stamp, beside the best seen (which may creep up, clocks drift)."""
     offset = f.arrival_us - t_us
-    f.lateness_us = min(offset, f.lateness_us + 20)
+    best = f.lateness_us + 20
+    f.lateness_us = offset if offset < best else best
     late_us = offset - f.lateness_us
     _age(f, offset)
     f.catching_up = late_us > _OLD_US and f.arrival_us - f.put_us < plan.control_us // 2

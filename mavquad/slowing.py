@@ -27,6 +27,8 @@ def fade(held_s: float, late_s: float, dt_s: float) -> float:
 
 def level(now: int, held_s: float) -> int:
     """Which design to fly with (0 the quick one): up at LATE_S, down again below two thirds of it."""
+    if not now and held_s < LATE_S[0]:
+        return 0
     up = sum(held_s >= limit for limit in LATE_S)
     down = sum(held_s >= limit * 2.0 / 3.0 for limit in LATE_S)
     return min(max(now, up), down)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mavquad import quat
+from mavquad import linalg, quat
 from mavquad.airframe import Airframe
 from mavquad.jit import kernel
 from mavquad.signals import Quat, Vec3
@@ -212,6 +212,109 @@ def thrust_acceleration(q: Quat, thrust_m_s2: float) -> Vec3:
     """g e3 - T R e3."""
     up = quat.rotate(q, (0.0, 0.0, thrust_m_s2))
     return (-up[0], -up[1], G_M_S2 - up[2])
+
+
+@kernel
+def law_of(record):
+    """The Law in a record's item."""
+    linear, quadratic = record.drag_linear_1_s, record.drag_quadratic_1_m
+    return Law(
+        (record.k[0], record.k[1], record.k[2]),
+        (record.k_down[0], record.k_down[1], record.k_down[2]),
+        (record.k_soft[0], record.k_soft[1], record.k_soft[2]),
+        record.lag_s,
+        record.lag_down_s,
+        record.jerk,
+        record.compensate,
+        (linear[0], linear[1], linear[2]),
+        (quadratic[0], quadratic[1], quadratic[2]),
+        record.drag,
+        record.integral,
+        record.tan_tilt,
+        record.down_min_m_s2,
+        record.down_max_m_s2,
+        record.slew_m_s3,
+    )
+
+
+@kernel
+def rest_of(g: Law, f_max: float, f: Vec3, v: Vec3) -> Vec3:
+    """The disturbance beyond the airframe's own drag, clipped."""
+    if not (math.isfinite(f[0]) and math.isfinite(f[1]) and math.isfinite(f[2])):
+        return (0.0, 0.0, 0.0)
+    d, _ = drag_along(g.drag_linear_1_s, g.drag_quadratic_1_m, v, (0.0, 0.0, 0.0))
+    m = f_max
+    return (min(m, max(-m, f[0] - d[0])), min(m, max(-m, f[1] - d[1])), min(m, max(-m, f[2] - d[2])))
+
+
+@kernel
+def aimed(g, f_max, predict, queue, integral, begun, estimate, delays, demand, dt_s):
+    """The closed form: (v, rest, path's command, integral's share, errors of p v a, free command, the last one, command in its limits).
+
+    estimate: p, v, q, thrust [m/s^2], f, now [s]; delays: until a command reaches the vehicle, until the attitude begins to follow, until
+    the thrust does [s], whether to fly gently; demand: p, v, a, jerk where the prediction ends; begun: a command was sent before.
+    """
+    p, v, q, thrust, f, now_s = estimate
+    link_s, level_s, down_s, gently = delays
+    p_ref, v_ref, a_ref, j_ref = demand
+    a = thrust_acceleration(q, thrust if math.isfinite(thrust) else G_M_S2)
+    rest = rest_of(g, f_max, f, v)
+    if predict:
+        level = ahead(g, p, v, a, rest, queue, now_s, level_s - link_s, level_s)
+        down = ahead(g, p, v, a, rest, queue, now_s, down_s - link_s, down_s)
+        p, v, a = mixed(level[0], down[0]), mixed(level[1], down[1]), mixed(level[2], down[2])
+    wanted, forward = path_part(g, v, rest, v_ref, a_ref, j_ref)
+    e_p, e_v, e_a = linalg.sub(p, p_ref), linalg.sub(v, v_ref), linalg.sub(a, wanted)
+    slow = linalg.scale(-g.integral, integral)
+    free = linalg.add(linalg.add(forward, slow), feedback(g.k_soft if gently else g.k, g.k_down, e_p, e_v, e_a))
+    last = (math.nan, math.nan, math.nan)
+    if begun:
+        newest = len(queue) - 1
+        last = (queue[newest, 1], queue[newest, 2], queue[newest, 3])
+    return v, rest, forward, slow, e_p, e_v, e_a, free, last, slewed(limited(g, free), last, g.slew_m_s3 * max(dt_s, 1e-3))
+
+
+@kernel
+def sent(g, queue, integral, e_p, free, command, f, acts_s, dt_s):
+    """(queue with the command, integral, disturbance that the command cancels)."""
+    if g.integral > 0.0:
+        integral = grown(integral, e_p, free, command, dt_s)
+    out = np.empty_like(queue)
+    n = len(queue)
+    out[: n - 1] = queue[1:]
+    out[n - 1, 0] = max(acts_s, out[n - 2, 0])  # none overtakes another
+    for i in range(3):
+        out[n - 1, 1 + i] = command[i]
+    return out, integral, linalg.scale(g.compensate, f) if math.isfinite(f[0]) else (0.0, 0.0, 0.0)
+
+
+@kernel
+def closed(law, f_max, predict, queue, integral, begun, estimate, delays, demand, dt_s):
+    """A step without constraints: (queue, integral, command, disturbance that it cancels). law: its record (1,); the rest as for `aimed`."""
+    g = law_of(law[0])
+    _, _, _, _, e_p, _, _, free, _, command = aimed(g, f_max, predict, queue, integral, begun, estimate, delays, demand, dt_s)
+    queue, integral, cancelled = sent(g, queue, integral, e_p, free, command, estimate[4], estimate[5] + delays[0], dt_s)
+    return queue, integral, command, cancelled
+
+
+@kernel
+def delays_of(predict, own_s, own_down_s, most_s, link_s):
+    """(until a command reaches the vehicle, until the attitude begins to follow, until the thrust does [s], whether to fly gently).
+
+    A delay out of range is not predicted through, but flown gently.
+    """
+    if not predict:
+        return 0.0, 0.0, 0.0, False
+    link, gently = link_s if math.isfinite(link_s) else 0.0, False
+    if not 0.0 <= own_s + link <= most_s:
+        gently, link = True, min(max(0.0, most_s - own_s), max(0.0, link))
+    return link, own_s + link, own_down_s + link, gently
+
+
+@kernel
+def mixed(level: Vec3, down: Vec3) -> Vec3:
+    """The horizontal axes of one, the vertical one of the other."""
+    return (level[0], level[1], down[2])
 
 
 @kernel

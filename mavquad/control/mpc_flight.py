@@ -22,29 +22,28 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from mavquad import flat
 from mavquad.airframe import Airframe
 from mavquad.control import constrained, prediction, qp
 from mavquad.control.lagged import (
     G_M_S2,
     Law,
-    ahead,
+    aimed,
     between,
-    drag_along,
-    feedback,
-    grown,
+    closed,
+    delays_of,
     limited,
     path_part,
     response,
-    slewed,
-    thrust_acceleration,
+    sent,
     turning,
 )
 from mavquad.errors import ConfigError
-from mavquad.linalg import add, scale, sub
 from mavquad.signals import NAN3, ZERO3, Command, Demand, Estimate, Vec3
 
 QUEUE = 64  # commands remembered
 STAGE_S, HORIZON = 0.05, 20
+Delays = tuple[float, float, float, bool]  # of `lagged.delays_of`
 _KNOT = 5  # stages between two looks at the path, interpolated between
 
 
@@ -104,6 +103,7 @@ class Gains(NamedTuple):
     rates: bool
     design: constrained.Design | None
     always: bool
+    flat: np.ndarray  # (1,) the law, for the kernels
 
 
 class State(NamedTuple):
@@ -114,15 +114,6 @@ class State(NamedTuple):
     axis: Vec3  # NaN before the first command
     programs: constrained.State | None
     steps: int
-
-
-class Delays(NamedTuple):
-    """From an estimate's stamp until what is commanded on it acts, and the horizontal gain for it."""
-
-    link_s: float  # until it reaches the vehicle
-    level_s: float  # until the attitude begins to follow
-    down_s: float
-    k: Vec3
 
 
 def gains(params: Params, airframe: Airframe) -> Gains:
@@ -161,6 +152,7 @@ def gains(params: Params, airframe: Airframe) -> Gains:
         params.rates,
         design,
         params.constrained == "always",
+        flat.of(law),
     )
 
 
@@ -178,45 +170,37 @@ def step(
     gains: Gains, state: State, estimate: Estimate, demand: Demand, preview: Callable[[int], Demand], dt_s: float
 ) -> tuple[State, Command]:
     """One control step."""
-    g = gains.law
-    p, v, f = estimate.p_ned_m, estimate.v_ned_m_s, estimate.f_ned_m_s2
-    delays = _delays(gains, estimate)
-    k = delays.k
-    thrust = estimate.thrust_m_s2 if math.isfinite(estimate.thrust_m_s2) else G_M_S2
-    a = thrust_acceleration(estimate.q_wxyz, thrust)
-    rest = _rest(gains, f, v)
-    now_s = 1e-6 * estimate.t_us
+    delays = delays_of(gains.predict, gains.delay_s, gains.delay_down_s, gains.delay_max_s, estimate.delay_s)
     if gains.predict:
-        level = ahead(g, p, v, a, rest, state.queue, now_s, delays.level_s - delays.link_s, delays.level_s)
-        down = ahead(g, p, v, a, rest, state.queue, now_s, delays.down_s - delays.link_s, delays.down_s)
-        p, v, a = _mixed(level[0], down[0]), _mixed(level[1], down[1]), _mixed(level[2], down[2])
         demand = _demand(preview, estimate.t_us, delays)
-    wanted, forward = path_part(g, v, rest, demand.v_ned_m_s, demand.a_ned_m_s2, demand.j_ned_m_s3)
-    e_p, e_v, e_a = sub(p, demand.p_ned_m), sub(v, demand.v_ned_m_s), sub(a, wanted)
-    slow = scale(-g.integral, state.integral_m_s)
-    free = add(add(forward, slow), feedback(k, g.k_down, e_p, e_v, e_a))
-    last = tuple(state.queue[-1, 1:].tolist()) if state.steps else NAN3
-    command = slewed(limited(g, free), last, g.slew_m_s3 * max(dt_s, 1e-3))
-    programs = state.programs
-    if gains.design is not None and programs is not None and k is g.k and math.isfinite(free[0] + free[1] + free[2]):
-        path = _horizon(gains, v, rest, forward, preview, estimate.t_us, delays)
-        path += slow
-        error = np.array([e_p, e_v, e_a]).T.copy()
-        limits = constrained.Horizon(
-            G_M_S2 - g.down_max_m_s2, G_M_S2 - g.down_min_m_s2, g.tan_tilt, g.slew_m_s3, max(dt_s, 1e-3)
+    now_s, f = 1e-6 * estimate.t_us, estimate.f_ned_m_s2
+    at = (estimate.p_ned_m, estimate.v_ned_m_s, estimate.q_wxyz, estimate.thrust_m_s2, f, now_s)
+    wanted = (demand.p_ned_m, demand.v_ned_m_s, demand.a_ned_m_s2, demand.j_ned_m_s3)
+    queue, integral, programs, begun = state.queue, state.integral_m_s, state.programs, state.steps > 0
+    if gains.design is None or programs is None:
+        queue, integral, command, cancelled = closed(
+            gains.flat, gains.f_max, gains.predict, queue, integral, begun, at, delays, wanted, dt_s
         )
-        before = last if state.steps else command
-        programs, move = constrained.solve(gains.design, programs, error, path, before, limits, G_M_S2, gains.always)
-        if move.usable:
-            command = limited(g, move.u)  # the octagon is drawn around the cone
-    integral = grown(state.integral_m_s, e_p, free, command, dt_s) if g.integral > 0.0 else state.integral_m_s
-    queue = np.empty_like(state.queue)
-    queue[:-1] = state.queue[1:]
-    queue[-1] = max(now_s + delays.link_s, float(queue[-2, 0])), *command  # none overtakes another
+    else:
+        g = gains.law
+        v, rest, forward, slow, e_p, e_v, e_a, free, last, command = aimed(
+            g, gains.f_max, gains.predict, queue, integral, begun, at, delays, wanted, dt_s
+        )
+        if not delays[3] and math.isfinite(free[0] + free[1] + free[2]):
+            path = _horizon(gains, v, rest, forward, preview, estimate.t_us, delays)
+            path += slow
+            error = np.array([e_p, e_v, e_a]).T.copy()
+            limits = constrained.Horizon(
+                G_M_S2 - g.down_max_m_s2, G_M_S2 - g.down_min_m_s2, g.tan_tilt, g.slew_m_s3, max(dt_s, 1e-3)
+            )
+            before = last if begun else command
+            programs, move = constrained.solve(gains.design, programs, error, path, before, limits, G_M_S2, gains.always)
+            if move.usable:
+                command = limited(g, move.u)  # the octagon is drawn around the cone
+        queue, integral, cancelled = sent(g, queue, integral, e_p, free, command, f, now_s + delays[0], dt_s)
     omega, axis = NAN3, state.axis
     if gains.rates:
         axis, omega = turning(command, axis, demand.yaw_rad, demand.yaw_rate_rad_s, max(dt_s, 1e-3))
-    cancelled = scale(g.compensate, f) if math.isfinite(f[0]) else ZERO3
     return (
         State(queue, integral, axis, programs, state.steps + 1),
         Command(command, demand.yaw_rad, demand.yaw_rate_rad_s, omega, cancelled),
@@ -225,15 +209,19 @@ def step(
 
 def _demand(preview: Callable[[int], Demand], t_us: int, delays: Delays) -> Demand:
     """The path where each axis' prediction ends."""
-    level = preview(t_us + round(1e6 * delays.level_s))
-    if delays.down_s == delays.level_s:
+    _, level_s, down_s, _ = delays
+    level = preview(t_us + round(1e6 * level_s))
+    if down_s == level_s:
         return level
-    down = preview(t_us + round(1e6 * delays.down_s))
-    return level._replace(
-        p_ned_m=_mixed(level.p_ned_m, down.p_ned_m),
-        v_ned_m_s=_mixed(level.v_ned_m_s, down.v_ned_m_s),
-        a_ned_m_s2=_mixed(level.a_ned_m_s2, down.a_ned_m_s2),
-        j_ned_m_s3=_mixed(level.j_ned_m_s3, down.j_ned_m_s3),
+    down = preview(t_us + round(1e6 * down_s))
+    return Demand(
+        level.t_us,
+        _mixed(level.p_ned_m, down.p_ned_m),
+        _mixed(level.v_ned_m_s, down.v_ned_m_s),
+        _mixed(level.a_ned_m_s2, down.a_ned_m_s2),
+        _mixed(level.j_ned_m_s3, down.j_ned_m_s3),
+        level.yaw_rad,
+        level.yaw_rate_rad_s,
     )
 
 
@@ -265,23 +253,3 @@ def diagnostics(state: State) -> dict[str, float]:
         "qp_fallbacks": float(programs.fallbacks),
         "qp_p99_s": p99,
     }
-
-
-def _delays(gains: Gains, estimate: Estimate) -> Delays:
-    """The delays to predict through and the gain to fly with: a delay out of range is not predicted, but flown gently."""
-    k = gains.law.k
-    if not gains.predict:
-        return Delays(0.0, 0.0, 0.0, k)
-    link = estimate.delay_s if math.isfinite(estimate.delay_s) else 0.0
-    if not 0.0 <= gains.delay_s + link <= gains.delay_max_s:
-        k, link = gains.law.k_soft, min(max(0.0, gains.delay_max_s - gains.delay_s), max(0.0, link))
-    return Delays(link, gains.delay_s + link, gains.delay_down_s + link, k)
-
-
-def _rest(gains: Gains, f: Vec3, v: Vec3) -> Vec3:
-    """The disturbance beyond the airframe's own drag, clipped."""
-    if not (math.isfinite(f[0]) and math.isfinite(f[1]) and math.isfinite(f[2])):
-        return ZERO3
-    d, _ = drag_along(gains.law.drag_linear_1_s, gains.law.drag_quadratic_1_m, v, ZERO3)
-    m = gains.f_max
-    return (min(m, max(-m, f[0] - d[0])), min(m, max(-m, f[1] - d[1])), min(m, max(-m, f[2] - d[2])))

@@ -110,9 +110,19 @@ def law(
     return (clip(ix, -i_max, i_max), clip(iy, -i_max, i_max), clip(iz, -i_max, i_max)), (ax, ay, az)
 
 
+@kernel
+def _flown(
+    gains: Gains, integral: Vec3, p: Vec3, v: Vec3, p_ref: Vec3, v_ref: Vec3, a_ref: Vec3, dt_s: float
+) -> tuple[Vec3, Vec3, Vec3]:
+    """`law`, and what it cancels already: the integral and the drag of the present speed. A compensator must not do so again."""
+    integral, a = law(gains, integral, p, v, p_ref, v_ref, a_ref, dt_s)
+    drag = drag_at(gains, v)
+    return integral, a, (-integral[0] - drag[0], -integral[1] - drag[1], -integral[2] - drag[2])
+
+
 def step(gains: Gains, state: State, estimate: Estimate, demand: Demand, preview: object, dt_s: float) -> tuple[State, Command]:
     """One control step."""
-    integral, a = law(
+    integral, a, cancelled = _flown(
         gains,
         state.integral_m_s2,
         estimate.p_ned_m,
@@ -122,9 +132,6 @@ def step(gains: Gains, state: State, estimate: Estimate, demand: Demand, preview
         demand.a_ned_m_s2,
         dt_s,
     )
-    # the integral and the drag of the present speed are already cancelled: a compensator must not cancel them again
-    drag = drag_at(gains, estimate.v_ned_m_s)
-    cancelled = (-integral[0] - drag[0], -integral[1] - drag[1], -integral[2] - drag[2])
     return State(integral), Command(a, demand.yaw_rad, demand.yaw_rate_rad_s, NAN3, cancelled)
 
 

@@ -310,8 +310,8 @@ def absorb(P: np.ndarray, dx: np.ndarray, row: int, residual: float, r: float, s
 
 @kernel
 def wrap(angle_rad: float) -> float:
-    """The same angle in [-pi, pi)."""
-    if -math.pi <= angle_rad < math.pi:
+    """The same angle in [-pi, pi); what is not finite stays as it is."""
+    if -math.pi <= angle_rad < math.pi or not math.isfinite(angle_rad):
         return angle_rad
     return angle_rad - 2.0 * math.pi * math.floor((angle_rad + math.pi) / (2.0 * math.pi))
 

@@ -131,32 +131,22 @@ def compensated(axes: Axes, w0: Vec3, feedforward: float, lead_s: float, butterw
 
 # ---- on a record's item: g of the gains' record, s of the state's; changed in place --------------------------------------
 @kernel
-def _vec3(a):
-    return (a[0], a[1], a[2])
-
-
-@kernel
-def _put3(to, v):
-    to[0], to[1], to[2] = v[0], v[1], v[2]
-
-
-@kernel
 def _filter_gains(g):
     e = g.ekf
-    return ekf.EkfGains(e.gravity_m_s2, e.drag_1_s, _vec3(e.inertia_kg_m2), e.rate_drag_nm_s, e.noise[:])
+    return ekf.EkfGains(e.gravity_m_s2, e.drag_1_s, flat.vec3(e.inertia_kg_m2), e.rate_drag_nm_s, e.noise[:])
 
 
 @kernel
 def _filter(s):
     q = (s.q_wxyz[0], s.q_wxyz[1], s.q_wxyz[2], s.q_wxyz[3])
-    return ekf.EkfState(_vec3(s.p_ned_m), _vec3(s.v_ned_m_s), q, _vec3(s.omega_rad_s), s.P[:], s.singular)
+    return ekf.EkfState(flat.vec3(s.p_ned_m), flat.vec3(s.v_ned_m_s), q, flat.vec3(s.omega_rad_s), s.P[:], s.singular)
 
 
 @kernel
 def _keep_filter(s, state):
-    _put3(s.p_ned_m, state.p_ned_m)
-    _put3(s.v_ned_m_s, state.v_ned_m_s)
-    _put3(s.omega_rad_s, state.omega_rad_s)
+    flat.put3(s.p_ned_m, state.p_ned_m)
+    flat.put3(s.v_ned_m_s, state.v_ned_m_s)
+    flat.put3(s.omega_rad_s, state.omega_rad_s)
     for i in range(4):
         s.q_wxyz[i] = state.q_wxyz[i]
     s.P[:] = state.P
@@ -166,17 +156,17 @@ def _keep_filter(s, state):
 @kernel
 def _axes(s):
     a = s.axes
-    return Axes(_vec3(a[0]), _vec3(a[1]), _vec3(a[2]), _vec3(a[3]), _vec3(a[4]), _vec3(a[5]))
+    return Axes(flat.vec3(a[0]), flat.vec3(a[1]), flat.vec3(a[2]), flat.vec3(a[3]), flat.vec3(a[4]), flat.vec3(a[5]))
 
 
 @kernel
 def _keep_axes(s, axes):
-    _put3(s.axes[0], axes.z1)
-    _put3(s.axes[1], axes.z2)
-    _put3(s.axes[2], axes.z3)
-    _put3(s.axes[3], axes.rate)
-    _put3(s.axes[4], axes.moved_m)
-    _put3(s.axes[5], axes.gained_m_s)
+    flat.put3(s.axes[0], axes.z1)
+    flat.put3(s.axes[1], axes.z2)
+    flat.put3(s.axes[2], axes.z3)
+    flat.put3(s.axes[3], axes.rate)
+    flat.put3(s.axes[4], axes.moved_m)
+    flat.put3(s.axes[5], axes.gained_m_s)
 
 
 @kernel
@@ -199,7 +189,7 @@ def _to(g, s, t_us):
         for i in range(4):
             s.q_wxyz[i] = turned[i]
         return
-    moved, axes = carry(_filter_gains(g), state, _axes(s), mean, _vec3(s.fast_m_s2), g.use_filter, dt_s)
+    moved, axes = carry(_filter_gains(g), state, _axes(s), mean, flat.vec3(s.fast_m_s2), g.use_filter, dt_s)
     _keep_filter(s, moved)
     _keep_axes(s, axes)
 
@@ -229,7 +219,7 @@ def hear_attitude(g, s, t_us, q, w):
     if first or not g.use_filter:
         for i in range(4):
             s.q_wxyz[i] = q[i]
-        _put3(s.omega_rad_s, w)
+        flat.put3(s.omega_rad_s, w)
     else:
         _update(g, s, _NAN3, _NAN3, quat.to_euler(q), w)
     s.attitude_us = t_us
@@ -249,21 +239,21 @@ def hear_position(g, s, t_us, p, v):
     if age_s > _LATE_S:
         return False
     x = _axes(s)
-    speed = _vec3(s.v_ned_m_s) if g.use_filter else axpy(1.0, x.gained_m_s, x.z2)
+    speed = flat.vec3(s.v_ned_m_s) if g.use_filter else axpy(1.0, x.gained_m_s, x.z2)
     thrust = known(_filter_gains(g), _filter(s).q_wxyz, s.thrust_m_s2, speed)
-    a = axpy(1.0, thrust, axpy(1.0, x.z3, _vec3(s.fast_m_s2)))
+    a = axpy(1.0, thrust, axpy(1.0, x.z3, flat.vec3(s.fast_m_s2)))
     p = axpy(age_s, speed, p)  # the sample carried forward to the filter's time
     v = axpy(age_s, a, v)
     y = p
     if g.use_filter:
         _update(g, s, p, v, _NAN3, _NAN3)
-        y = _vec3(s.p_ned_m)
+        y = flat.vec3(s.p_ned_m)
         if g.anchor_s > 0.0:
             w = 1.0 - math.exp(-1e-6 * (t_us - s.position_us) / g.anchor_s)
-            offset = _vec3(s.offset_m)
-            _put3(s.offset_m, axpy(w, axpy(-1.0, offset, axpy(-1.0, y, p)), offset))
+            offset = flat.vec3(s.offset_m)
+            flat.put3(s.offset_m, axpy(w, axpy(-1.0, offset, axpy(-1.0, y, p)), offset))
     since_s = max(1e-3, 1e-6 * (s.t_us - s.axes_us))
-    _keep_axes(s, observed(x, y, _vec3(g.w0), g.tau_f_s, g.butterworth, since_s))
+    _keep_axes(s, observed(x, y, flat.vec3(g.w0), g.tau_f_s, g.butterworth, since_s))
     s.axes_us, s.position_us = s.t_us, t_us
     return True
 
@@ -279,10 +269,10 @@ def _place(g, s, t_us, p, v):
             s.P[j, i] = 0.0
     for i in range(6):
         s.P[i, i] = g.ekf.noise[ekf.P0, i]
-    _put3(s.p_ned_m, p)
-    _put3(s.v_ned_m_s, v)
-    _keep_axes(s, Axes(p, v, _vec3(s.axes[2]), _ZERO3, _ZERO3, _ZERO3))
-    _put3(s.offset_m, _ZERO3)
+    flat.put3(s.p_ned_m, p)
+    flat.put3(s.v_ned_m_s, v)
+    _keep_axes(s, Axes(p, v, flat.vec3(s.axes[2]), _ZERO3, _ZERO3, _ZERO3))
+    flat.put3(s.offset_m, _ZERO3)
     s.t_us = max(s.t_us, t_us)
     s.axes_us, s.position_us = s.t_us, t_us
 
@@ -302,15 +292,15 @@ def hear_imu(g, s, t_us, accel, gyro):
         if g.use_filter:
             _update(g, s, _NAN3, _NAN3, _NAN3, gyro)
         else:
-            _put3(s.omega_rad_s, gyro)
+            flat.put3(s.omega_rad_s, gyro)
     if g.accel_tau_s > 0.0 and s.position_us > 0 and finite3(accel):
         gains, state = _filter_gains(g), _filter(s)
         felt = axpy(1.0, quat.rotate(state.q_wxyz, accel), (0.0, 0.0, gains.gravity_m_s2))
         rest = axpy(-1.0, known(gains, state.q_wxyz, s.thrust_m_s2, state.v_ned_m_s), felt)
         since_s = 1e-6 * (t_us - s.imu_us) if s.imu_us > 0 else 0.0
         w = 1.0 - math.exp(-min(since_s, _COAST_S) / g.accel_tau_s)
-        fast = _vec3(s.fast_m_s2)
-        _put3(s.fast_m_s2, axpy(w, axpy(-1.0, fast, rest), fast))
+        fast = flat.vec3(s.fast_m_s2)
+        flat.put3(s.fast_m_s2, axpy(w, axpy(-1.0, fast, rest), fast))
     s.imu_us = t_us
     return True
 
@@ -326,13 +316,13 @@ def estimate(g, s, t_us, sent_us, thrust_m_s2, delay_s):
         return _NAN3, _NAN3, q, w, _NAN3, s.delay_s, s.thrust_m_s2
     x = _axes(s)
     if g.use_filter:
-        p, v = axpy(1.0, _vec3(s.offset_m), state.p_ned_m), state.v_ned_m_s
+        p, v = axpy(1.0, flat.vec3(s.offset_m), state.p_ned_m), state.v_ned_m_s
     else:
         since_s = 1e-6 * (s.t_us - s.axes_us)
         p = axpy(1.0, axpy(0.5 * since_s * since_s, x.z3, x.moved_m), axpy(since_s, x.z2, x.z1))
         v = axpy(1.0, axpy(since_s, x.z3, x.gained_m_s), x.z2)
-    f = compensated(x, _vec3(g.w0), g.feedforward, g.lead_s, g.butterworth)
-    f = axpy(-g.ekf.drag_1_s, v, axpy(1.0, f, _vec3(s.fast_m_s2)))
+    f = compensated(x, flat.vec3(g.w0), g.feedforward, g.lead_s, g.butterworth)
+    f = axpy(-g.ekf.drag_1_s, v, axpy(1.0, f, flat.vec3(s.fast_m_s2)))
     return p, v, q, w, f, s.delay_s, s.thrust_m_s2
 
 

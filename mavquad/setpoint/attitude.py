@@ -49,3 +49,11 @@ def attitude(thrust_ned_m_s2: Vec3, yaw_rad: float) -> tuple[Quat, float]:
     c, s = math.cos(0.5 * twist), math.sin(0.5 * twist)
     # (w, tx, ty, 0) (x) (c, 0, 0, s)
     return ((w * c, tx * c + ty * s, ty * c - tx * s, w * s), size)
+
+
+@kernel
+def pointing(a_ned_m_s2: Vec3, yaw_rad: float, tilt_max_rad: float) -> tuple[Quat, float, float]:
+    """(q_wxyz, specific thrust, its vertical part [m/s^2]) for an acceleration and a heading, thrust within 0.2 to 1.8 g."""
+    thrust = thrust_vector(a_ned_m_s2, tilt_max_rad, 0.2 * G_M_S2, 1.8 * G_M_S2)
+    q, size = attitude(thrust, yaw_rad)
+    return q, size, thrust[2]

@@ -28,6 +28,7 @@ from mavquad.plan import Plan
 from mavquad.setpoint import attitude, limits
 from mavquad.settings import Companion
 from mavquad.signals import ZERO3, Attitude, Demand, Position, Setpoint
+from tools import fused_tick
 from tools.benches import Row
 
 _ROUNDS = 15
@@ -194,45 +195,43 @@ def loops(seconds: float) -> list[Row]:
 
 
 # ---- a composed tick --------------------------------------------------------------------------------------------------------
+_MPC = {"controller": "eskf-mpc", "estimator": "joint", "tune": {"eskf-mpc": {"constrained": "off"}}}
+_MPC_ASMF = {**_MPC, "compensator": "asmf"}
+
+
 def composed(seconds: float) -> list[Row]:
-    """Decode, EKF, closed-form MPC, ASMF, encode: CPU time of one control period."""
-    rows = []
+    """Decode, EKF, closed-form MPC, ASMF, encode: CPU time of one control period, staged and as one compiled function."""
+    what, note, rows = "decode, estimate, control, encode: one tick", "2.3 messages in", []
     for who, chosen in (
         ("pid", {"controller": "pid"}),
-        (
-            "EKF + closed-form MPC",
-            {"controller": "eskf-mpc", "estimator": "joint", "tune": {"eskf-mpc": {"constrained": "off"}}},
-        ),
-        (
-            "EKF + closed-form MPC + ASMF",
-            {
-                "controller": "eskf-mpc",
-                "estimator": "joint",
-                "compensator": "asmf",
-                "tune": {"eskf-mpc": {"constrained": "off"}},
-            },
-        ),
+        ("EKF + closed-form MPC", _MPC),
+        ("EKF + closed-form MPC + ASMF", _MPC_ASMF),
     ):
         plan, flight = hovering(**chosen)
-        many, k, per_tick = max(25, round(10 * seconds)), 30, []
-        for round_ in range(_ROUNDS + 1):
-            frames = [b"".join(telemetry(k + i)) for i in range(many)]
-            begun = time.process_time_ns()
-            for i, data in enumerate(frames):
-                flight = pipeline.feed_all(plan, flight, (k + i) * _DT_US + 5000, wire.split(data)[0])
-            if round_:
-                per_tick.append(1e-3 * (time.process_time_ns() - begun) / many)
-            k += many
-        rows.append(
-            _row(
-                "decode, estimate, control, encode: one tick",
-                who,
-                per_tick,
-                "us CPU",
-                "stages called from Python, 2.3 messages in",
-            )
-        )
+
+        def staged(k: int, data: bytes) -> None:
+            nonlocal flight
+            flight = pipeline.feed_all(plan, flight, k * _DT_US + 5000, wire.split(data)[0])  # noqa: B023 # called at once
+
+        rows.append(_row(what, who, _cpu_per_tick(staged, seconds), "us CPU", f"stages called from Python, {note}"))
+    fused = fused_tick.Tick(*hovering(**_MPC_ASMF))
+    spent = _cpu_per_tick(lambda k, data: fused.feed(wire.split(data)[0]), seconds)
+    rows.append(_row(what, "EKF + closed-form MPC + ASMF, fused", spent, "us CPU", f"one compiled function, {note}"))
     return rows
+
+
+def _cpu_per_tick(turn: Callable[[int, bytes], object], seconds: float) -> list[float]:
+    """CPU time [us] of a tick, by rounds; one round before that warms up."""
+    many, k, per_tick = max(25, round(10 * seconds)), 30, []
+    for round_ in range(_ROUNDS + 1):
+        frames = [b"".join(telemetry(k + i)) for i in range(many)]
+        begun = time.process_time_ns()
+        for i, data in enumerate(frames):
+            turn(k + i, data)
+        if round_:
+            per_tick.append(1e-3 * (time.process_time_ns() - begun) / many)
+        k += many
+    return per_tick
 
 
 # ---- the programs -------------------------------------------------------------------------------------------------------------
