@@ -146,13 +146,18 @@ def _restarted(plan: Plan, f: Flight) -> None:
 
 def _continuous(plan: Plan, f: Flight, sample: Position) -> Position:
     """The position without the autopilot's own resets: a jump that velocity cannot explain moves our frame, not the vehicle."""
-    p = (sample.p_ned_m[0] - f.offset_m[0], sample.p_ned_m[1] - f.offset_m[1], sample.p_ned_m[2] - f.offset_m[2])
+    (x, y, z), (v_n, v_e, v_d), offset = sample.p_ned_m, sample.v_ned_m_s, f.offset_m
+    p = (x - offset[0], y - offset[1], z - offset[2])
     last = f.position
     if last is not None:
         dt_s = 1e-6 * (sample.t_us - last.t_us)
-        jump = [p[i] - last.p_ned_m[i] - 0.5 * dt_s * (sample.v_ned_m_s[i] + last.v_ned_m_s[i]) for i in range(3)]
-        if max(abs(x) for x in jump) > plan.settings.safety.reset_m + 2.0 * dt_s and f.life.state in (STREAMING, ENGAGED):
-            f.offset_m = (f.offset_m[0] + jump[0], f.offset_m[1] + jump[1], f.offset_m[2] + jump[2])
+        (x, y, z), (w_n, w_e, w_d) = last.p_ned_m, last.v_ned_m_s
+        half = 0.5 * dt_s
+        jump = (p[0] - x - half * (v_n + w_n), p[1] - y - half * (v_e + w_e), p[2] - z - half * (v_d + w_d))
+        most = plan.settings.safety.reset_m + 2.0 * dt_s
+        jumped = abs(jump[0]) > most or abs(jump[1]) > most or abs(jump[2]) > most
+        if jumped and f.life.state in (STREAMING, ENGAGED):
+            f.offset_m = (offset[0] + jump[0], offset[1] + jump[1], offset[2] + jump[2])
             p = (p[0] - jump[0], p[1] - jump[1], p[2] - jump[2])
             outbox.count(f, "position resets")
             outbox.say(plan, f, f"position reset of {math.hypot(*jump):.2f} m", 4)
