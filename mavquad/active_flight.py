@@ -73,7 +73,7 @@ class Gains(NamedTuple):
 class State(NamedTuple):
     """What arrived since the last step, and the record of `active_tick`."""
 
-    record: np.ndarray  # (1,)
+    record: np.ndarray  # its bytes
     attitude: Attitude | None
     velocity: Position | None
     echo: Target | None
@@ -179,4 +179,4 @@ def step(
 
 def published(state: State) -> tuple[float, ...]:
     """What is shown, named by PUBLISHED. NaN before there is an estimate."""
-    return tuple(state.record["shown"][0].tolist())
+    return tuple(state.record.view(active_tick.RECORD)["shown"][0].tolist())

@@ -60,12 +60,12 @@ RECORD = flat.record(
 
 
 def start() -> np.ndarray:
-    """Nothing heard, nothing sent: as if gravity had been commanded for ever."""
+    """The bytes of a record: nothing heard, nothing sent, as if gravity had been commanded for ever."""
     out = np.zeros(1, RECORD)
     line = command_line.init(np.array([0.0, 0.0, G_M_S2]), _LINE)
     out["line_us"][0], out["line"][0] = line.t_us, line.value
     out["shown"][0, :12] = out["shown"][0, 19] = math.nan
-    return out
+    return out.view(np.uint8)
 
 
 @kernel
@@ -82,7 +82,7 @@ def quiet_half_width(model):
 @kernel
 def followed(state, echo_us, q_wxyz):
     """Whether the autopilot's echo is close to what was sent shortly before."""
-    return follows(state[0], echo_us, q_wxyz)
+    return follows(state.view(RECORD)[0], echo_us, q_wxyz)
 
 
 @kernel
@@ -100,9 +100,8 @@ def follows(s, echo_us, q_wxyz):
 @kernel
 def blind(state, t_us, active):
     """A tick without an attitude or a velocity yet."""
-    out = np.empty_like(state)
-    out[0] = state[0]
-    s = out[0]
+    out = state.copy()
+    s = out.view(RECORD)[0]
     s.t_us, s.active, s.authority = t_us, active, 0.0
     _show(s)
     return out
@@ -117,9 +116,8 @@ def tick(model, correction, own, state, t_us, active, applied, heard, nominal):
     last agreed with what was sent, sum, number and sum of stamps of the accelerometer samples; nominal: acceleration, heading,
     what it cancels.
     """
-    out = np.empty_like(state)
-    out[0] = state[0]
-    s = out[0]
+    out = state.copy()
+    s = out.view(RECORD)[0]
     a, cancelled = advance(model[0], correction, own, s, t_us, active, applied, heard, nominal)
     return out, a, cancelled
 

@@ -1,7 +1,8 @@
 """A NamedTuple of numbers as one numpy record, which a kernel takes as one argument.
 
 A call from Python into a kernel costs about 30 ns for every float of a nested tuple on the way in and 60 on the way out, a record
-half a microsecond whatever is in it. Inside of a kernel both are read alike: `gains.filter.e[i]`.
+half a microsecond whatever is in it. Inside of a kernel both are read alike: `gains.filter.e[i]`. A state that comes out of one kernel and
+goes into the next travels as bytes, `state.view(RECORD)[0]`: for a record numba would compare every field of both dtypes, 5 us a call.
 """
 
 from typing import Any

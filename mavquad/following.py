@@ -43,18 +43,18 @@ RECORD = flat.record(
 
 class State(NamedTuple):
     follows: bool
-    record: np.ndarray  # (1,)
+    record: np.ndarray  # its bytes
 
     @property
     def apart_s(self) -> float:
         """For how long they have been apart, weighed by how far."""
-        return float(self.record["apart_s"][0])
+        return float(self.record.view(RECORD)["apart_s"][0])
 
 
 def _start() -> State:
     record = np.zeros(1, RECORD)
     record["rule_rad"] = _RULE_RAD
-    return State(True, record)
+    return State(True, record.view(np.uint8))
 
 
 START = _start()
@@ -91,9 +91,8 @@ def step(response: AttitudeResponse, state: State, t_us: int, sent: Quat, measur
 
 @kernel
 def _step(state, follows, response, t_us, sent, measured, delay_s):
-    out = np.empty_like(state)
-    out[0] = state[0]
-    s = out[0]
+    out = state.copy()
+    s = out.view(RECORD)[0]
     now, wanted = axis(measured), axis(sent)
     dt_s = 1e-6 * (t_us - s.t_us)
     if s.t_us == 0 or not 0.0 < dt_s < 0.5:  # the beginning, or a gap: nothing is known of what happened in it

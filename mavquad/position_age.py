@@ -42,36 +42,34 @@ RECORD = flat.record(
         ("age_s", "f8"),  # as corrected now
     ]
 )
-START = np.zeros(1, RECORD)
+START = np.zeros(1, RECORD).view(np.uint8)
 
 
 def age_s(state: np.ndarray) -> float:
     """How much older than its stamp a position is taken to be now [s]."""
-    return float(state["age_s"][0])
+    return float(state.view(RECORD)["age_s"][0])
 
 
 @kernel
 def feel(state: np.ndarray, t_us: int, accel_m_s2: Vec3, q_wxyz: tuple[float, float, float, float]) -> np.ndarray:
     """An accelerometer's sample, body axes, turned by the newest attitude."""
-    out = np.empty_like(state)
-    out[0] = state[0]
-    feel_in(out[0], t_us, accel_m_s2, q_wxyz)
+    out = state.copy()
+    feel_in(out.view(RECORD)[0], t_us, accel_m_s2, q_wxyz)
     return out
 
 
 @kernel
 def hear(state: np.ndarray, t_us: int, v_ned_m_s: Vec3) -> np.ndarray:
     """A velocity by its stamp: what it tells of its age."""
-    out = np.empty_like(state)
-    out[0] = state[0]
-    hear_in(out[0], t_us, v_ned_m_s)
+    out = state.copy()
+    hear_in(out.view(RECORD)[0], t_us, v_ned_m_s)
     return out
 
 
 @kernel
 def carried(state: np.ndarray, p_ned_m: Vec3, v_ned_m_s: Vec3) -> tuple[Vec3, Vec3]:
     """(p, v) at their stamp, from what was stamped too late."""
-    return carried_by(state[0], p_ned_m, v_ned_m_s)
+    return carried_by(state.view(RECORD)[0], p_ned_m, v_ned_m_s)
 
 
 # ---- on a record's item, in place ---------------------------------------------------------------------------------------

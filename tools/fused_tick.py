@@ -129,7 +129,9 @@ def begin(f: Flight) -> np.ndarray:
     """The record of the state of an engaged flight on PX4."""
     state = np.zeros(1, STATE)
     s = state[0]
-    s["joint"], s["active"], s["age"] = f.estimator[0], f.compensator.record[0], f.position_age[0]
+    s["joint"] = f.estimator.view(joint_tick.RECORD)[0]
+    s["active"] = f.compensator.record.view(active_tick.RECORD)[0]
+    s["age"] = f.position_age.view(position_age.RECORD)[0]
     s["queue"], s["integral_m_s"], s["begun"] = f.controller.queue, f.controller.integral_m_s, f.controller.steps > 0
     s["now_us"], s["pace_us"], s["gap_us"], s["control_us"] = f.now_us, f.pace_us, f.control_gap_us, f.control_us
     heard, sent = f.compensator, f.sent

@@ -54,12 +54,12 @@ RECORD = flat.record(
 
 
 def start(gains: ekf.EkfGains) -> np.ndarray:
-    """Nothing heard yet."""
+    """The bytes of a record: nothing heard yet."""
     out = np.zeros(1, RECORD)
     first = ekf.init(gains, ekf.NOTHING)
     out["q_wxyz"], out["P"], out["thrust_m_s2"] = first.q_wxyz, first.P, applied_thrust.G_M_S2
     applied_thrust.start(out)
-    return out
+    return out.view(np.uint8)
 
 
 @kernel
@@ -330,39 +330,34 @@ def estimate(g, s, t_us, sent_us, thrust_m_s2, delay_s):
 @kernel
 def with_attitude(gains, state, t_us, q, w):
     """(whether it was taken, the record with an attitude)."""
-    out = np.empty_like(state)
-    out[0] = state[0]
-    return hear_attitude(gains[0], out[0], t_us, q, w), out
+    out = state.copy()
+    return hear_attitude(gains[0], out.view(RECORD)[0], t_us, q, w), out
 
 
 @kernel
 def with_position(gains, state, t_us, p, v):
     """(whether it was taken, the record with a position)."""
-    out = np.empty_like(state)
-    out[0] = state[0]
-    return hear_position(gains[0], out[0], t_us, p, v), out
+    out = state.copy()
+    return hear_position(gains[0], out.view(RECORD)[0], t_us, p, v), out
 
 
 @kernel
 def with_imu(gains, state, t_us, accel, gyro):
     """(whether it was taken, the record with an accelerometer's and a gyro's sample)."""
-    out = np.empty_like(state)
-    out[0] = state[0]
-    return hear_imu(gains[0], out[0], t_us, accel, gyro), out
+    out = state.copy()
+    return hear_imu(gains[0], out.view(RECORD)[0], t_us, accel, gyro), out
 
 
 @kernel
 def with_echo(state, t_us, collective):
     """The record with the autopilot's echo of a setpoint."""
-    out = np.empty_like(state)
-    out[0] = state[0]
-    applied_thrust.hear(out[0], t_us, collective)
+    out = state.copy()
+    applied_thrust.hear(out.view(RECORD)[0], t_us, collective)
     return out
 
 
 @kernel
 def with_sent(gains, state, t_us, sent_us, thrust_m_s2, delay_s):
     """(the record at t with what was sent, `estimate`)."""
-    out = np.empty_like(state)
-    out[0] = state[0]
-    return out, estimate(gains[0], out[0], t_us, sent_us, thrust_m_s2, delay_s)
+    out = state.copy()
+    return out, estimate(gains[0], out.view(RECORD)[0], t_us, sent_us, thrust_m_s2, delay_s)

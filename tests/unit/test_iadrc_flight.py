@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mavquad import airframe, config, plan, quat
 from mavquad.control import adrc_flight, iadrc_flight, lagged, pid
 from mavquad.errors import ConfigError
-from mavquad.estimate import applied_thrust, direct, joint_flight, leso_flight
+from mavquad.estimate import applied_thrust, direct, joint_flight, joint_tick, leso_flight
 from mavquad.settings import Companion
 from mavquad.signals import NAN3, ZERO3, Applied, Attitude, Demand, Estimate, Imu, Position
 from tests.oracles.outer_flight import World, fly
@@ -128,11 +128,11 @@ def test_thrust_that_does_not_carry_is_a_disturbance():
 
 def test_the_same_sample_twice_is_the_same_as_once_and_an_old_one_is_ignored():
     state, _, now = at_rest(1.0)
-    again = Position(int(state["position_us"][0]), (50.0, 50.0, 50.0), ZERO3)
+    again = Position(int(state.view(joint_tick.RECORD)["position_us"][0]), (50.0, 50.0, 50.0), ZERO3)
     for sample in (
         again,
         again._replace(t_us=now - 600_000),
-        Attitude(int(state["attitude_us"][0]), quat.from_euler(1.0, 0, 0), ZERO3),
+        Attitude(int(state.view(joint_tick.RECORD)["attitude_us"][0]), quat.from_euler(1.0, 0, 0), ZERO3),
     ):
         assert joint_flight.observe(G, state, sample) is state
 
@@ -163,12 +163,12 @@ def test_the_gyro_stands_in_where_no_attitude_comes():
     state, _, now = at_rest(1.0)
     for k in range(1, 100):
         state = joint_flight.observe(G, state, Imu(now + 200_000 + 4000 * k, (0.0, 0.0, -9.8), (0.5, 0.0, 0.0)))
-    assert state["omega_rad_s"][0, 0] == pytest.approx(0.5, abs=0.01)
+    assert state.view(joint_tick.RECORD)["omega_rad_s"][0, 0] == pytest.approx(0.5, abs=0.01)
 
 
 def test_thrust_is_what_was_sent_a_delay_ago_and_the_echo_counts_where_there_is_one():
     record = joint_flight.init(G)
-    thrust = record[0]
+    thrust = record.view(joint_tick.RECORD)[0]
     assert applied_thrust.acting(thrust, 0, True) == pytest.approx(9.80665)
     for k in range(100):
         applied_thrust.remember(thrust, 8000 * k, 10.0 + 0.01 * k, 0.04)

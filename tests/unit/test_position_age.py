@@ -61,10 +61,10 @@ def test_a_vehicle_at_rest_tells_nothing_and_nothing_is_changed():
 
 def test_gaps_and_nonsense_begin_again_or_are_dropped():
     state, _ = heard(0.05, seconds=20.0)
-    imu_us, position_us = int(state["imu_us"][0]), int(state["position_us"][0])
+    imu_us, position_us = (int(state.view(position_age.RECORD)[name][0]) for name in ("imu_us", "position_us"))
     lost = (math.nan, 0.0, 0.0)
     assert position_age.feel(state, imu_us + 4000, lost, quat.IDENTITY).tobytes() == state.tobytes()
     assert position_age.hear(state, position_us + 20_000, lost).tobytes() == state.tobytes()
     after = position_age.feel(state, imu_us + 2_000_000, (0.0, 0.0, -G_M_S2), quat.IDENTITY)
-    assert after["position_us"][0] == 0
+    assert after.view(position_age.RECORD)["position_us"][0] == 0
     assert position_age.age_s(after) == position_age.age_s(state)  # constant within a boot

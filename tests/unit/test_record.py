@@ -13,6 +13,7 @@ from mavquad.estimate import (
     extended_state_record,
     joint_flight,
     joint_record,
+    joint_tick,
     leso_flight,
     record,
 )
@@ -63,7 +64,9 @@ def _flown(module, gains, samples, events):
                 )
             else:
                 state = state.copy()
-                joint_flight.applied_thrust.remember(state[0], applied.t_us, applied.thrust_m_s2, applied.delay_s)
+                joint_tick.applied_thrust.remember(
+                    state.view(joint_tick.RECORD)[0], applied.t_us, applied.thrust_m_s2, applied.delay_s
+                )
         else:
             state = module.observe(gains, state, sample)
         if asked:
