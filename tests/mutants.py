@@ -2,7 +2,8 @@
 
   NUMBA_DISABLE_JIT=1 python -m tests.mutants mavquad.setpoint.limits tests/unit/test_setpoint.py tests/unit/test_limits_exactly.py
 
-Every mutant runs the tests in a forked child, as plain Python. Prints the survivors; exit 1 where there are any.
+Every mutant runs the tests in a forked child, as plain Python. Prints the survivors, and on stderr how far it is; exit 1 where
+there are any.
 """
 
 import ast
@@ -12,6 +13,8 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+
+import pytest  # before the forks
 
 COMPARE = {ast.Lt: ast.GtE, ast.Gt: ast.LtE, ast.LtE: ast.Gt, ast.GtE: ast.Lt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq}
 BINARY = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.BitOr: ast.BitAnd}
@@ -76,8 +79,6 @@ def survives(name: str, code: str, tests: list[str]) -> bool:
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, 1)
         os.dup2(null, 2)
-        import pytest
-
         module = importlib.import_module(name)
         exec(compile(code, str(module.__file__), "exec"), module.__dict__)
         status = int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:randomly", *tests]))
@@ -99,9 +100,10 @@ def main(argv: list[str]) -> int:
     if not survives(name, text, tests):
         print("the tests fail without a change", file=sys.stderr)
         return 2
-    total = alive = 0
-    for line, what, tree in mutants(ast.parse(text)):
-        total += 1
+    changed = list(mutants(ast.parse(text)))
+    total, alive = len(changed), 0
+    for at, (line, what, tree) in enumerate(changed, 1):
+        print(f"{at} of {total}, {alive} survived", end="\r", file=sys.stderr, flush=True)
         if survives(name, source(tree), tests):
             alive += 1
             print(f"{file}:{line}: {what}: {lines[line - 1].strip()}", flush=True)
