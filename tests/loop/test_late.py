@@ -43,7 +43,8 @@ def now_s(late):
 def flown_well(late, last_s, spread_m):
     assert late.life.state == lifecycle.ENGAGED, late.texts
     assert max(late.spread(last_s)) < spread_m
-    assert math.dist(late.truth[-1][1:], late.flight.anchor_p_m) < 0.7
+    leaning = late.plan.settings.controller == "pd"  # without an integral the wind leaves it aside, further with slower gains
+    assert math.dist(late.truth[-1][1:], late.flight.anchor_p_m) < (1.6 if leaning else 0.7)
     assert not late.sim.autopilot.crashed
 
 
