@@ -121,6 +121,15 @@ class Airframe(config.Section, frozen=True):
             )
 
     def _check_rotors(self, r: Rotors) -> None:
+        if (
+            not 0.0 < r.arm_m <= 100.0
+            or r.torque_per_thrust_m <= 0.0
+            or not 0.0 <= r.lag_s <= 1.0
+            or not 0.0 <= r.thrust_min_n < r.thrust_max_n
+        ):
+            raise ConfigError(
+                f"[rotors] = {r}: expected arm_m 0 to 100, torque_per_thrust_m > 0, lag_s 0 to 1, 0 <= thrust_min_n < thrust_max_n"
+            )
         bound = self.body.mass_kg * r.arm_m**2
         jx, jy, jz = self.body.inertia_kg_m2
         if max(jx, jy) > 0.5 * bound or jz > bound:
@@ -132,14 +141,6 @@ class Airframe(config.Section, frozen=True):
             raise ConfigError(
                 f"rotors.thrust_max_n = {r.thrust_max_n}: four of them must lift at least 1.1 times the weight"
                 f" ({1.1 * self.body.mass_kg * 9.80665 / 4.0:.3g} N each)"
-            )
-        if (
-            min(r.arm_m, r.torque_per_thrust_m) <= 0.0
-            or not 0.0 <= r.lag_s <= 1.0
-            or not 0.0 <= r.thrust_min_n < r.thrust_max_n
-        ):
-            raise ConfigError(
-                f"[rotors] = {r}: expected arm_m, torque_per_thrust_m > 0, lag_s 0 to 1, 0 <= thrust_min_n < thrust_max_n"
             )
 
 

@@ -13,6 +13,7 @@ from mavquad.identify import timebase
 JITTER = 0.1  # 1 sigma of the spacing, of the period
 SATURATED = 0.01  # of the samples
 MOVING = 0.02  # least standard deviation of what two signs are compared by (rad/s, m/s)
+ENOUGH = 50  # samples, below which nothing is compared
 OPPOSED = -0.5  # correlation below: the two run against each other
 Span = tuple[float, float]
 
@@ -73,9 +74,11 @@ def command_cut(axis: str, sent: timebase.Held, taken: timebase.Held, spans: Seq
 
 def against(rate: np.ndarray, value: np.ndarray, dt_s: float) -> bool:
     """Whether a rate (n,) runs against the change of what it is the rate of, both on even samples."""
+    if len(value) < ENOUGH:
+        return False
     change = np.gradient(value, dt_s)
     known = np.isfinite(rate) & np.isfinite(change)
-    if known.sum() < 50 or min(np.std(rate[known]), np.std(change[known])) < MOVING:
+    if known.sum() < ENOUGH or min(np.std(rate[known]), np.std(change[known])) < MOVING:
         return False
     return bool(np.corrcoef(rate[known], change[known])[0, 1] < OPPOSED)
 

@@ -74,11 +74,11 @@ class Listener:
                     elif self.companion:
                         data = sock.recv(65536)
                         self.front.sendto(data, self.companion)
-                        for frame in wire.split(data)[0]:
+                        for frame in wire.datagram(data)[0]:
                             self.down.add(frame.raw)
 
     def _up(self, data):
-        for frame in wire.split(data)[0]:
+        for frame in wire.datagram(data)[0]:
             if not self.down.frames and frame.msgid == HEARTBEAT:
                 self.greetings += 1  # into the dark, before anybody was heard: no part of what a log replays
                 continue

@@ -24,6 +24,8 @@ def test_a_mass_changed_by_percent():
         ("body.inertia_kg_m2=[2.0, 2.0, 2.0]", r"impossible for 2.0 kg on arms of 0.246 m"),
         ("body.inertia_kg_m2=[0.01, 0.01, 0.05]", r"no body has one axis above the sum"),
         ("body.mass_kg=-1", r"body.mass_kg = -1.0: expected 0.01 to 1000 kg"),
+        ("rotors.arm_m=1e300", r"\[rotors\] = .*expected arm_m 0 to 100"),
+        ("rotors.arm_m=0", r"\[rotors\] = .*expected arm_m 0 to 100"),
         ("body.mass_kg=heavy", r"body.mass_kg = 'heavy': Expected `float`, got `str`"),
         ("rotors.thrust_max_n=2", r"must lift at least 1.1 times the weight"),
         ("bdoy.mass_kg=1", r'there is no \[bdoy\]; did you mean "body"\?'),
