@@ -43,9 +43,16 @@ def now_s(late):
 def flown_well(late, last_s, spread_m):
     assert late.life.state == lifecycle.ENGAGED, late.texts
     assert max(late.spread(last_s)) < spread_m
-    leaning = late.plan.settings.controller == "pd"  # without an integral the wind leaves it aside, further with slower gains
-    assert math.dist(late.truth[-1][1:], late.flight.anchor_p_m) < (1.6 if leaning else 0.7)
+    assert math.dist(late.truth[-1][1:], late.flight.anchor_p_m) < 0.7
     assert not late.sim.autopilot.crashed
+
+
+def left_aside(request, controller, seed, late_s):
+    """What is not reached: pd has no integral, and slowed by 0.3 s and more the wind of seed 12 leaves it 0.76 to 1.13 m aside."""
+    if (controller, seed) == ("pd", 12) and late_s >= 0.3:
+        request.applymarker(
+            pytest.mark.xfail(strict=True, reason="pd has no integral: slowed, this wind leaves it over 0.7 m aside")
+        )
 
 
 @pytest.mark.parametrize("controller", ["iadrc", *[pytest.param(name, marks=pytest.mark.slow) for name in ("pid", "eskf-mpc")]])
@@ -109,7 +116,8 @@ def test_a_starved_companion_lets_go_and_says_so():
 @pytest.mark.parametrize("controller", ALL)
 @pytest.mark.parametrize("seed", [11, 12])
 @pytest.mark.parametrize("stall_s", [0.05, 0.1, 0.2, 0.3, 0.5, 0.8])
-def test_stalls_again_and_again(controller, seed, stall_s):
+def test_stalls_again_and_again(controller, seed, stall_s, request):
+    left_aside(request, controller, seed, stall_s)
     late = engaged(controller, seed)
     late.wakes = stalled(now_s(late), stall_s, 3.0)
     late.run(30.0)
@@ -124,7 +132,8 @@ def test_stalls_again_and_again(controller, seed, stall_s):
 @pytest.mark.parametrize("controller", ALL)
 @pytest.mark.parametrize("seed", [11, 12])
 @pytest.mark.parametrize("period_s", [0.05, 0.1, 0.2, 0.3])
-def test_slow_loops(controller, seed, period_s):
+def test_slow_loops(controller, seed, period_s, request):
+    left_aside(request, controller, seed, period_s)
     late = engaged(controller, seed)
     late.wakes = every(period_s)
     late.run(30.0)
