@@ -23,7 +23,8 @@ ANSWER_S = 10.0  # the partner's time for one barrier
 _POLL_S = 0.2  # how soon a signal is noticed
 _AHEAD = 2  # barriers under way at most
 _SLICE_US = 4_000  # of vehicle time at a speed
-_BEHIND_S = 0.25  # further behind the wall clock than this, the simulation stops trying to catch up
+_BEHIND_US = 250_000  # of vehicle time: further behind the wall clock than this, the simulation stops trying to catch up
+_ROUND = 256  # datagrams read from one socket before vehicle time goes on
 
 
 class Port:
@@ -70,11 +71,11 @@ class Ports:
         self._copies.append((socket.socket(socket.AF_INET, socket.SOCK_DGRAM), address))
 
     def receive(self, timeout_s: float) -> bool:
-        """Take what arrives within timeout_s (at least one round of all sockets). True when a barrier was answered."""
+        """Take what is there, else what arrives within timeout_s (0: nothing is waited for). True when a barrier was answered."""
         if len(self._ports) == 1:
             return self._read(self._ports[0], timeout_s)
         answered = False
-        share = max(1e-4, timeout_s / len(self._ports))
+        share = timeout_s / len(self._ports)
         for port in self._ports:
             answered |= self._read(port, share)
         return answered
@@ -102,13 +103,13 @@ class Ports:
 
     def _read(self, port: Port, timeout_s: float) -> bool:
         """One datagram, waited for; then whatever else is there."""
-        answered, flags = False, 0
+        flags = 0
         port.socket.settimeout(timeout_s)
-        while True:
+        for _ in range(_ROUND):
             try:
                 data, address = port.socket.recvfrom(65536, flags)
             except (TimeoutError, BlockingIOError):
-                return answered
+                break
             except ConnectionError:
                 continue
             link = port.links.get(address)
@@ -119,6 +120,7 @@ class Ports:
             if self._sim.receive(link, data):
                 return True
             flags = socket.MSG_DONTWAIT
+        return False
 
     def _out(self, sock: socket.socket, data: bytes, address: Address) -> None:
         try:
@@ -199,18 +201,23 @@ class Run:
                 )
 
     def realtime(self, speed: float) -> None:
-        """Nobody waits; vehicle time runs at `speed` times wall time as far as the machine allows."""
-        zero_s = time.monotonic()
+        """Nobody waits; vehicle time runs at `speed` times wall time as far as the machine allows.
+
+        What has arrived is read before each slice, the more so behind the clock: vehicle time must not run on while setpoints wait.
+        """
+        zero_s, behind_s = time.monotonic(), 1e-6 * _BEHIND_US / speed
         while not self._over():
             until_us = min(self.sim.t_us + _SLICE_US, self.sim.period_end_us)
             due_s = zero_s + 1e-6 * until_us / speed
             left_s = due_s - time.monotonic()
-            if left_s < -_BEHIND_S:
+            if left_s < -behind_s:
                 self._late_s -= left_s
                 zero_s -= left_s
-            while left_s > 0.0:
-                self.ports.receive(min(left_s, _POLL_S))
-                left_s = due_s - time.monotonic() if not self._stop else 0.0
+            while True:
+                self.ports.receive(max(0.0, min(left_s, _POLL_S)))
+                left_s = due_s - time.monotonic()
+                if left_s <= 0.0 or self._stop:
+                    break
             self._pacing_ms.append(1e3 * max(0.0, -left_s))
             ended = until_us == self.sim.period_end_us
             self.sim.run_until(until_us)
