@@ -16,8 +16,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from mavquad import lifecycle, pipeline, position_age, relay, wire
+from mavquad import lane, lifecycle, pipeline, position_age, relay, wire
 from mavquad.errors import FlightError
+from mavquad.lane import Lane
 from mavquad.lifecycle import Life
 from mavquad.link import clock, health
 from mavquad.link.endpoint import Address, Endpoint, UdpEndpoint
@@ -68,6 +69,8 @@ class Companion:
         self.lockstep = lockstep
         self.signer = signer
         self.flight: Flight = pipeline.start(plan)
+        plain = isinstance(endpoint, UdpEndpoint) and not relays and signer is None
+        self.lane = Lane(plan, lockstep) if plain and lane.serves(plan) else None
         path = next_log(run, "flight")
         self.log = Writer(path)
         self.trace = TraceWriter(path.with_suffix(".trace"), plan.trace_names)
@@ -121,6 +124,7 @@ class Companion:
 
         Until our autopilot is known one at a time: which frames are accepted depends on it.
         """
+        self._settle()
         target, sources = self.flight.life.target, self.sources
         if target == (0, 0) and len(frames) > 1:
             for frame in frames:
@@ -141,6 +145,37 @@ class Companion:
         self._act(accepted, stamp_us)
         if self._address is None and self.flight.life.target in sources:
             self._found(address, stamp_us)
+
+    def _quick(self, data: bytes, address: Address) -> bool:
+        """A datagram of plain telemetry, all at once (`lane`): logged and answered as frame by frame. False: nothing was done with it."""
+        fast = self.lane
+        if fast is None or address != self._address or self._waiting:
+            return False
+        while True:
+            if not fast.inside and not fast.enter(self.flight, self.sources.get(self.flight.life.target)):
+                return False
+            verdict = fast.feed(data, self._stamp_us, self.flight.due_us)
+            if verdict == lane.DONE:
+                break
+            self._settle()
+            if verdict == lane.OTHER:
+                return False
+            self._emit(pipeline.advance(self.plan, self.flight, fast.stamp_us))  # timers first
+        self._stamp_us = self._address_us = fast.stamp_us
+        self.received += fast.frames
+        self.setpoints += fast.setpoints
+        self.log.write_bytes(fast.stamp_us, fast.log)
+        if fast.trace:
+            self.trace.write_bytes(fast.trace)
+        if fast.sent:
+            self._to_send.append(fast.sent)
+        return True
+
+    def _settle(self) -> None:
+        """Whatever comes next is not for the fast lane: the flight as it is."""
+        if self.lane is not None and self.lane.inside:
+            target = self.flight.life.target
+            self.flight, self.sources[target] = self.lane.leave(self.flight)
 
     def _act(self, frames: list[Frame], stamp_us: int) -> None:
         if stamp_us >= self.flight.due_us:  # timers first: they are logged at their own due time
@@ -213,6 +248,7 @@ class Companion:
     def _want_engage(self, stamp_us: int) -> None:
         if self._engage and self.flight.life.state == lifecycle.OBSERVING:
             self._engage = False
+            self._settle()
             self._act([request(lifecycle.CMD_ENGAGE, self.plan, 0)], stamp_us)
 
     # ---- the two loops --------------------------------------------------------------------------------------------
@@ -275,18 +311,18 @@ class Companion:
             if guard and guard.saw(sum(address != self._address for _, address in arrived), self._address, begun):
                 self._say_flooded(guard)
             for data, address in arrived:
-                frames = self._frames(data, address)
-                if not frames:
-                    continue
                 before = self.setpoints
                 self._stamp_us = max(self._stamp_us, clock.wall_us())  # of what waited behind others, too: it is that late
-                self.take(frames, address, self._stamp_us)
-                self._flush()
-                if self.setpoints > before:
-                    self.latency_us.append(1e6 * (clock.monotonic_s() - begun))
+                if not self._quick(data, address):
+                    frames = self._frames(data, address)
+                    if not frames:
+                        continue
+                    self.take(frames, address, self._stamp_us)
+                self._send_off(before, begun)
                 last_heard = begun
             if self.flight.heartbeat_us:
                 if self._stamp_us >= self.flight.due_us:
+                    self._settle()
                     self._emit(pipeline.advance(self.plan, self.flight, self._stamp_us))
                 self._want_engage(self._stamp_us)
                 self._listen_to_relays()
@@ -351,6 +387,10 @@ class Companion:
                 continue
             waited_s = 0.0
             for data, address in arrived:
+                before = self.setpoints
+                if not self._engage and self._quick(data, address):  # a whole period and its barrier
+                    self._send_off(before, begun)
+                    continue
                 frames = self._frames(data, address)
                 if self._address not in (None, address):  # somebody else: outside of the periods
                     self.take(frames, address, self._stamp_us)
@@ -380,6 +420,10 @@ class Companion:
         self._listen_to_relays()
         self._want_engage(self._stamp_us)
         self.take(frames[-1:], address, self._stamp_us)  # its answer ends the period
+        self._send_off(before, begun)
+
+    def _send_off(self, before: int, begun: float) -> None:
+        """Send what has gathered; how long it took where a setpoint is among it, `before` the setpoints before."""
         self._flush()
         if self.setpoints > before:
             self.latency_us.append(1e6 * (clock.monotonic_s() - begun))
@@ -387,6 +431,7 @@ class Companion:
     # ---- at the end --------------------------------------------------------------------------------------------------
     def summary(self) -> dict[str, Any]:
         """What happened, for `fly` and for people."""
+        self._settle()
         life = self.flight.life
         latency = sorted(self.latency_us) or [math.nan]
         edges = [10.0 ** (1.0 + k / 8.0) for k in range(33)]  # 10 us to 0.1 s

@@ -92,14 +92,19 @@ def step(response: AttitudeResponse, state: State, t_us: int, sent: Quat, measur
 @kernel
 def _step(state, follows, response, t_us, sent, measured, delay_s):
     out = state.copy()
-    s = out.view(RECORD)[0]
+    return step_in(out.view(RECORD)[0], follows, response, t_us, sent, measured, delay_s), out
+
+
+@kernel
+def step_in(s, follows, response, t_us, sent, measured, delay_s):
+    """`step` on a record's item, in place, response as (natural frequency, damping, delay): whether setpoints are followed."""
     now, wanted = axis(measured), axis(sent)
     dt_s = 1e-6 * (t_us - s.t_us)
     if s.t_us == 0 or not 0.0 < dt_s < 0.5:  # the beginning, or a gap: nothing is known of what happened in it
         s.sent_count, s.apart_s, s.together_s = 0, 0.0, 0.0
         _send(s, t_us, wanted)
         s.axis[0], s.axis[1], s.rate[0], s.rate[1], s.t_us = now[0], now[1], 0.0, 0.0, t_us
-        return follows, out
+        return follows
     _send(s, t_us, wanted)
     natural_rad_s, damping, own_delay_s = response
     x, v = answer(
@@ -116,7 +121,14 @@ def _step(state, follows, response, t_us, sent, measured, delay_s):
     elif s.apart_s > FOR_S + delay_s:
         follows = False
     s.axis[0], s.axis[1], s.rate[0], s.rate[1], s.t_us = x[0], x[1], v[0], v[1], t_us
-    return follows, out
+    return follows
+
+
+@kernel
+def reset_in(s):
+    """A record's item as at the start."""
+    s.sent_count, s.t_us, s.rule_rad, s.apart_s, s.together_s = 0, 0, _RULE_RAD, 0.0, 0.0
+    s.axis[0], s.axis[1], s.rate[0], s.rate[1] = 0.0, 0.0, 0.0, 0.0
 
 
 @kernel

@@ -25,5 +25,9 @@ class TraceWriter:
     def write(self, row: tuple[float, ...]) -> None:
         self._file.write(self._row.pack(*row))
 
+    def write_bytes(self, rows: bytes) -> None:
+        """Rows as they are to lie in the file."""
+        self._file.write(rows)
+
     def close(self) -> None:
         self._file.close()

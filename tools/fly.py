@@ -45,7 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--estimator", help="what feeds the controller (default: the controller's own)")
     parser.add_argument("--compensator", help="none or asmf")
-    parser.add_argument("--observer", action="append", metavar="NAME[:KEY=VALUE,...]", help="one more to watch; again for more")
+    parser.add_argument("--observer", action="append", metavar="NAME[:KEY=VALUE,...]", help="one to watch; again for more; none: without")
     parser.add_argument(
         "--attitude", choices=("ahrs", "mocap", "both"), default="ahrs", help="attitude source (default: %(default)s)"
     )
@@ -142,7 +142,7 @@ def resolve(args: argparse.Namespace) -> Any:
         controller=args.controller,
         estimator=args.estimator,
         compensator=args.compensator,
-        observers=args.observer,
+        observers=[] if args.observer == ["none"] else args.observer,
         loop=args.loop,
         signing_key=args.signing_key,
     )

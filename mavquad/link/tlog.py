@@ -45,7 +45,7 @@ class Writer:
 
     def write(self, t_us: int, raw: bytes) -> None:
         """One frame with its stamp, in one unbuffered write. Raises LogError where the disk takes no more."""
-        self._put(t_us, t_us.to_bytes(STAMP, "big") + raw)
+        self.write_bytes(t_us, t_us.to_bytes(STAMP, "big") + raw)
 
     def write_all(self, records: list[tuple[int, bytes]]) -> None:
         """Many frames in one write: those of a datagram, or of a moment. Raises LogError as `write`."""
@@ -56,9 +56,10 @@ class Writer:
                 last_us, stamp = t_us, t_us.to_bytes(STAMP, "big")
             parts += (stamp, raw)
         if parts:
-            self._put(last_us, b"".join(parts))
+            self.write_bytes(last_us, b"".join(parts))
 
-    def _put(self, t_us: int, record: bytes) -> None:
+    def write_bytes(self, t_us: int, record: bytes) -> None:
+        """Records as they are to lie in the log, of which the last is stamped t_us. Raises LogError as `write`."""
         try:
             written = os.write(self._fd, record)
             while written < len(record):  # a signal or a nearly full disk: the rest, or the reason

@@ -1,0 +1,124 @@
+"""The fast lane: a datagram of plain telemetry through one compiled function, for `pid` and `pd` on the autopilot's own estimate.
+
+`pipeline` is what a companion does; this gives the same bytes for the datagrams that hold nothing out of the ordinary, in a tenth of the time. A text, a fault, a timer, a person's request: the shell
+takes the flight back (`leave`) and goes through the pipeline, which is also what a replay does. So every replay compares the two.
+"""
+
+import numpy as np
+
+from mavquad import flat, lane_record, lane_tick, lifecycle, messages, wire
+from mavquad.flight import Flight
+from mavquad.jit import COMPILED
+from mavquad.lane_tick import DONE, OTHER, TIMERS
+from mavquad.link.health import Source
+from mavquad.link.signing import SETUP_SIGNING
+from mavquad.plan import Plan
+
+__all__ = ["DONE", "OTHER", "TIMERS", "Lane", "serves"]
+
+_KINDS = {
+    "LOCAL_POSITION_NED": lane_tick.POSITION,
+    "HIGHRES_IMU": lane_tick.IMU,
+    "ATTITUDE_TARGET": lane_tick.TARGET,
+    "ATTITUDE_QUATERNION": lane_tick.ATTITUDE,
+    "ATTITUDE": lane_tick.EULER,
+    "TIMESYNC": lane_tick.TIMESYNC,
+    "EXTENDED_SYS_STATE": lane_tick.LANDED,
+    "SYS_STATUS": lane_tick.BATTERY,
+}
+
+
+def serves(plan: Plan) -> bool:
+    """Whether the lane knows the stages of a plan."""
+    settings = plan.settings
+    return (
+        settings.controller in ("pid", "pd")
+        and plan.estimator.label == "direct"
+        and plan.compensator is None
+        and not plan.observers
+        and plan.imu_spared
+        and settings.loop == "attitude"
+        and COMPILED
+    )
+
+
+def _table(plan: Plan) -> np.ndarray:
+    """(65536,) int16: kind << 8 | CRC extra of each message, -1 unknown."""
+    table = np.full(1 << 16, -1, np.int16)
+    others = {*messages.HANDLERS, *plan.samples, SETUP_SIGNING}
+    for msgid, name in wire.NAME.items():
+        if msgid < table.size:
+            kind = _KINDS.get(name, lane_tick.OTHERS if msgid in others else lane_tick.NOTHING)
+            table[msgid] = kind << 8 | wire.SPECS[msgid].crc_extra
+    return table
+
+
+class Lane:
+    """The fast lane of one companion, whose flight it holds between `enter` and `leave`."""
+
+    def __init__(self, plan: Plan, lockstep: bool) -> None:
+        self.inside = False
+        self._plan, self._lockstep = plan, lockstep
+        self._tuned: Plan | None = None
+        self._target, self._autopilot = (0, 0), 0
+        self._memory = lane_record.room()
+        self._state = self._memory[lane_record.STATE_AT :]
+        self._memory[lane_record.TABLE_AT : lane_record.LOG_AT].view(np.int16)[:] = _table(plan)
+        self._rows = self._memory[lane_record.ROWS_AT : lane_record.PLACES_AT].view(np.float64)
+        self._tell(plan)
+        self.log = self.sent = self.trace = b""
+        self.stamp_us = self.setpoints = self.frames = 0
+        self.feed(b"\xfd", 0, 0)  # loaded from the cache before anything flies
+
+    def _tell(self, plan: Plan) -> None:
+        """Write all that does not change."""
+        own, response, safety = plan.settings.link, plan.airframe.attitude, plan.settings.safety
+        fixed = self._memory[: lane_record.FIXED.itemsize].view(lane_record.FIXED)[0]
+        flat.fill(fixed.pid, plan.controller.gains)
+        flat.fill(fixed.gate, plan.limits)
+        flat.fill(fixed.path, plan.path)
+        told = {
+            "carry_s": plan.estimator.gains.carry_s, "reset_m": safety.reset_m, "late_us": round(1e6 * safety.late_s),
+            "natural_frequency_rad_s": response.natural_frequency_rad_s, "damping": response.damping,
+            "response_delay_s": response.delay_s, "duration_us": round(1e6 * plan.path.duration_s), "control_us": plan.control_us,
+            "ardupilot": self._autopilot == lifecycle.ARDUPILOT, "system": own.system, "component": own.component,
+            "target_system": self._target[0], "target_component": self._target[1],
+            "setpoint_extra": wire.spec("SET_ATTITUDE_TARGET").crc_extra, "timesync_extra": wire.spec("TIMESYNC").crc_extra,
+            "timesync_bytes": wire.spec("TIMESYNC").length,
+        }  # fmt: skip
+        for name, value in told.items():
+            fixed[name] = value
+
+    def enter(self, flight: Flight, source: Source | None) -> bool:
+        """Take a flight over, where it can be flown here; the counter of its autopilot's frames with it."""
+        if source is None or not lane_record.plain(flight):
+            return False
+        life = flight.life
+        if flight.tuned is not self._tuned or (life.target, life.autopilot) != (self._target, self._autopilot):
+            self._tuned, self._target, self._autopilot = flight.tuned, life.target, life.autopilot
+            self._tell(flight.tuned or self._plan)
+        lane_record.load(self._state, flight, source)
+        self.inside = True
+        return True
+
+    def leave(self, flight: Flight) -> tuple[Flight, Source]:
+        """The flight as it is now, from the one that was taken over, and the counter of frames."""
+        self.inside = False
+        return lane_record.unload(self._state, flight)
+
+    def feed(self, data: bytes, arrival_us: int, due_us: int) -> int:
+        """One datagram of the autopilot. DONE: `log`, `sent`, `trace`, `stamp_us`, `setpoints` and `frames` are what came of it.
+
+        TIMERS: something of the flight's falls due by `stamp_us`, before it. OTHER: nothing was done; it is the pipeline's.
+        """
+        if len(data) > lane_record.MOST_BYTES:
+            return OTHER
+        verdict, self.stamp_us, logged, sent, rows, self.setpoints, self.frames = lane_tick.feed(
+            self._memory, np.frombuffer(data, np.uint8), arrival_us, due_us, self._lockstep
+        )
+        if verdict == DONE:
+            memory, log_at, sent_at = self._memory, lane_record.LOG_AT, lane_record.SENT_AT
+            self.log = memory[log_at : log_at + logged].tobytes()
+            self.sent = memory[sent_at : sent_at + sent].tobytes()
+            self.trace = self._rows[: lane_record.COLUMNS * rows].tobytes()
+        return int(verdict)
