@@ -1,7 +1,8 @@
 """The fast lane: a datagram of plain telemetry through one compiled function, for `pid` and `pd` on the autopilot's own estimate.
 
-`pipeline` is what a companion does; this gives the same bytes for the datagrams that hold nothing out of the ordinary, in a tenth of the time. A text, a fault, a timer, a person's request: the shell
-takes the flight back (`leave`) and goes through the pipeline, which is also what a replay does. So every replay compares the two.
+`pipeline` is what a companion does; this gives the same bytes, in a tenth of the time, for the datagrams that hold nothing out of the
+ordinary. A text, a fault, a timer, a person's request: the shell takes the flight back (`leave`) and goes through the pipeline, which
+is also what a replay does. So every `replay --verify` of such a flight compares the two.
 """
 
 import numpy as np

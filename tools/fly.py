@@ -45,7 +45,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--estimator", help="what feeds the controller (default: the controller's own)")
     parser.add_argument("--compensator", help="none or asmf")
-    parser.add_argument("--observer", action="append", metavar="NAME[:KEY=VALUE,...]", help="one to watch; again for more; none: without")
+    parser.add_argument(
+        "--observer", action="append", metavar="NAME[:KEY=VALUE,...]", help="one to watch; again for more; none: without"
+    )
     parser.add_argument(
         "--attitude", choices=("ahrs", "mocap", "both"), default="ahrs", help="attitude source (default: %(default)s)"
     )
