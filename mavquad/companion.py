@@ -16,7 +16,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from mavquad import lane, lifecycle, pipeline, position_age, relay, wire
+from mavquad import lane, lifecycle, pipeline, position_age, relay, strangers, wire
 from mavquad.errors import FlightError
 from mavquad.lane import Lane
 from mavquad.lifecycle import Life
@@ -35,7 +35,6 @@ _LOCKSTEP_WAIT_S, _LOCKSTEP_POLL_S = 10.0, 0.2
 _SILENCE_S = 5.0
 _LATENCIES = 1 << 16  # the last ones, for the summary: memory stays flat however long the flight
 _RELAY_S = 0.02  # a further link waits no longer for us, however silent the autopilot is
-_MOVED_S = 3.0  # an autopilot silent for so long may come back from another address
 _TIMESYNC = wire.ID["TIMESYNC"]
 _SETPOINTS = frozenset((wire.ID["SET_ATTITUDE_TARGET"], wire.ID["SET_POSITION_TARGET_LOCAL_NED"]))
 _STICKS = wire.ID["SET_ACTUATOR_CONTROL_TARGET"]
@@ -94,23 +93,28 @@ class Companion:
         self._said_broken: set[str] = set()
 
     # ---- one frame ----------------------------------------------------------------------------------------------
-    def _refuse(self, frame: Frame, stamp_us: int, reason: str) -> None:
+    def _refuse(self, frame: Frame, address: Address, stamp_us: int, reason: str) -> None:
         if frame.msgid != SETUP_SIGNING:  # a key belongs in no log
             if self._refused is None:
                 self._refused = Writer(self._refused_path)
             self._refused.write(stamp_us, frame.raw)
         self.refused[reason] = self.refused.get(reason, 0) + 1
+        if self.refused[reason] > 1:  # said once
+            return
+        print(strangers.words(frame, address, reason), file=sys.stderr, flush=True)
+        if reason in strangers.POSING and self.flight.life.target != (0, 0):
+            self._act([strangers.notice(frame, address)], stamp_us)
 
     def _accepts(self, frame: Frame, address: Address, stamp_us: int) -> bool:
         reason = self.signer.refuses(frame, stamp_us) if self.signer else ""
         reason = reason or pipeline.accepts(self.plan, self.flight, frame)
         if not reason and (frame.system, frame.component) == self.flight.life.target and address != self._address:
-            if self._address is not None and stamp_us - self._address_us < _MOVED_S * 1e6:
-                reason = "our autopilot's id from another address"
+            if self._address is not None and stamp_us - self._address_us < strangers.MOVED_S * 1e6:
+                reason = strangers.ELSEWHERE
             else:
                 self._found(address, stamp_us)
         if reason:
-            self._refuse(frame, stamp_us, reason)
+            self._refuse(frame, address, stamp_us, reason)
         return not reason
 
     def _found(self, address: Address, stamp_us: int) -> None:
@@ -286,8 +290,9 @@ class Companion:
 
     def _frames(self, data: bytes, address: Address) -> list[Frame]:
         """Frames of a datagram, or of a piece of a byte stream."""
-        for link in self.relays:
-            link.copy(data)
+        if self._address in (None, address):  # what others send here is not the autopilot's
+            for link in self.relays:
+                link.copy(data)
         if isinstance(self.endpoint, UdpEndpoint):
             frames, junk = wire.datagram(data)
         else:

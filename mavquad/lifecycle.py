@@ -294,8 +294,9 @@ def on_time(life: Life, now_us: int) -> tuple[Life, Sends]:
         if p.tries >= _TRIES:
             life = life._replace(pending=None)
             if p.purpose == "rate":
+                life, said = _say_once(life, "no answer to rate requests")
                 life, more = _rate_answered(life, False, now_us)
-                return life, sends + more
+                return life, sends + said + more
             life = life._replace(phase=f"wait {p.purpose}", since_us=now_us)
             return life, (text(f"mavquad: no answer to {p.purpose}", 4),)
         life = life._replace(pending=p._replace(tries=p.tries + 1, due_us=now_us + _RETRY_US))

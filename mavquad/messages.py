@@ -1,14 +1,17 @@
 """What the companion does with each message that is no sample: one handler per message, one table. Pure."""
 
+import math
 from collections.abc import Callable
 from typing import Any
 
-from mavquad import lifecycle, outbox, publish, tunables, wire
+from mavquad import lifecycle, outbox, publish, strangers, tunables, wire
 from mavquad.errors import ConfigError
 from mavquad.flight import Flight
 from mavquad.link import signals as decode
 from mavquad.plan import Plan
 from mavquad.wire import Frame
+
+_DOES_NOT_EXIST = 1  # MAV_PARAM_ERROR
 
 
 def _heartbeat(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
@@ -25,7 +28,7 @@ def _command_ack(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
         outbox.send_all(plan, f, sends)
 
 
-def _command_long(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
+def _command(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
     own = plan.settings.link
     if m.target_component != own.component or m.target_system not in (0, own.system):
         return
@@ -38,6 +41,8 @@ def _statustext(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
     if (frame.system, frame.component) == f.life.target:
         f.life, sends = lifecycle.on_text(f.life, m, f.arrival_us)
         outbox.send_all(plan, f, sends)
+    elif strangers.is_notice(frame) and f.life.target != (0, 0):
+        outbox.say(plan, f, m.text, 4)
 
 
 def _timesync(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
@@ -55,6 +60,9 @@ def _param_value(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
     value = m.param_value
     if f.life.autopilot != lifecycle.ARDUPILOT and m.param_type <= 6:
         value = float(decode.int_of_float(value, m.param_type))
+    if not math.isfinite(value):
+        outbox.count(f, "PARAM_VALUE refused")
+        return
     f.life = lifecycle.on_param(f.life, m.param_id, value, f.arrival_us)
     if m.param_id in ("MPC_THR_HOVER", "MOT_THST_HOVER") and 0.05 < value < 0.95:
         f.hover_thrust = value
@@ -74,8 +82,12 @@ def _param_request_read(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
     if m.param_index >= 0:
         if m.param_index < len(names):
             _send_param(plan, f, m.param_index)
+        else:
+            _no_param(plan, f, frame, m)
     elif m.param_id in names:
         _send_param(plan, f, names.index(m.param_id))
+    else:
+        _no_param(plan, f, frame, m)
 
 
 def _param_set(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
@@ -83,6 +95,7 @@ def _param_set(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
         return
     names = [t.name for t in tunables.tunables(plan)]
     if m.param_id not in names:
+        _no_param(plan, f, frame, m)
         return
     try:
         f.tuned = plan = tunables.change(plan, m.param_id, m.param_value)
@@ -96,6 +109,13 @@ def _param_set(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
 def _send_param(plan: Plan, f: Flight, index: int) -> None:
     known = tunables.tunables(plan)
     outbox.send(plan, f, "PARAM_VALUE", (known[index].name, known[index].value, 9, len(known), index))
+
+
+def _no_param(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
+    """Said by who was asked by name; to a question for everybody, others have the answer."""
+    if m.target_component == plan.settings.link.component:
+        fields = (frame.system, frame.component, m.param_id, getattr(m, "param_index", -1), _DOES_NOT_EXIST)
+        outbox.send(plan, f, "PARAM_ERROR", fields)
 
 
 def _for_us(plan: Plan, m: Any) -> bool:
@@ -121,7 +141,8 @@ def _sys_status(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
 _BY_NAME: dict[str, Callable[[Plan, Flight, Frame, Any], None]] = {
     "HEARTBEAT": _heartbeat,
     "COMMAND_ACK": _command_ack,
-    "COMMAND_LONG": _command_long,
+    "COMMAND_LONG": _command,
+    "COMMAND_INT": _command,
     "STATUSTEXT": _statustext,
     "TIMESYNC": _timesync,
     "PARAM_VALUE": _param_value,

@@ -9,7 +9,7 @@ import math
 import zlib
 from collections.abc import Iterable
 
-from mavquad import control_step, lifecycle, messages, outbox, publish, samples, wire
+from mavquad import control_step, lifecycle, messages, outbox, publish, samples, strangers, wire
 from mavquad.flight import Flight, start
 from mavquad.lifecycle import ENGAGED, STREAMING
 from mavquad.plan import Plan, build
@@ -85,7 +85,7 @@ def accepts(plan: Plan, flight: Flight, frame: Frame) -> str:
     """ "" where the companion takes the frame, else why not: it belongs in the log of refused frames."""
     own = plan.settings.link
     if (frame.system, frame.component) == (own.system, own.component):
-        return "our own address"
+        return strangers.OURSELVES
     if frame.msgid == _SETUP_SIGNING:
         return "a key sent over the link"
     target = flight.life.target

@@ -1,7 +1,8 @@
 """Further links beside the one to the autopilot: a ground station or a monitor sees and says what it would on a link of its own.
 
-Whatever passes on the autopilot's link, both ways, is copied as it is, so every system keeps its own sequence numbers. What comes from
-a further link goes to the autopilot as it is, but for what is meant for us alone and for what claims to be the autopilot or us.
+Whatever passes between the autopilot and us, both ways, is copied as it is, so every system keeps its own sequence numbers; what others
+send to our port is not. What comes from a further link goes to the autopilot as it is, but for what is meant for us alone and for what
+claims to be the autopilot or us.
 """
 
 from mavquad.errors import LinkError

@@ -17,6 +17,7 @@ from mavquad.wire import Frame
 AUTOPILOT, COMPANION = 1, 191
 SAMPLE_US = 250_000  # of the histories
 HISTORY = 240  # samples: one minute
+STRANGERS = 16  # that are named
 LOST_US = 2_000_000  # without a HEARTBEAT for so long a vehicle is lost
 _FRESH_MS = 2000  # what a companion said longer ago is no news
 _CLOCK_BACK_MS = 2_000  # a boot clock that goes back further has started again
@@ -114,6 +115,7 @@ class Watch:
         self.vehicles: dict[int, Vehicle] = {}
         self.texts: deque[Text] = deque(maxlen=500)
         self.said = 0  # texts ever
+        self.strangers: dict[str, int] = {}  # ids from a second address, in words: frames that were not shown
         self._sample_us = 0
 
     def take(self, t_us: int, frame: Frame) -> None:
@@ -148,6 +150,15 @@ class Watch:
     def say(self, severity: int, sender: str, words: str) -> None:
         self.texts.append(Text(self.now_us, severity, sender, words))
         self.said += 1
+
+    def stranger(self, sender: tuple[int, int], address: tuple[str, int]) -> None:
+        """A frame by the name of a sender that is at another address."""
+        words = f"{sender[0]}/{sender[1]} from {address[0]}:{address[1]} too"
+        if words not in self.strangers:
+            if len(self.strangers) == STRANGERS:
+                return
+            self.say(3, "monitor", f"{words}: two have one id, or somebody poses; not shown")
+        self.strangers[words] = self.strangers.get(words, 0) + 1
 
     def recall(self, texts: Iterable[Text]) -> None:
         """What the companions' own texts say of their states."""

@@ -11,6 +11,7 @@ from mavquad.errors import LinkError
 from mavquad.link import clock
 from mavquad.link.columns import Log
 from mavquad.link.endpoint import Address, Endpoint, open_endpoint
+from mavquad.strangers import MOVED_S
 from mavquad.wire import Frame
 from tools.watch import AUTOPILOT, HEARTBEAT, LOST_US, Watch
 
@@ -43,6 +44,7 @@ class Live:
         self._endpoint: Endpoint = open_endpoint(name)
         self._waiting: deque[tuple[int, bytes, Address]] = deque()
         self._rest: dict[Address, bytes] = {}
+        self._homes: dict[tuple[int, int], tuple[Address, int]] = {}  # where each sender is, and when it was heard there
         self._requester = Requester(self._endpoint) if request_rates else None
         self._opened_us = clock.wall_us()
         self._stop = threading.Event()
@@ -66,10 +68,22 @@ class Live:
             self._rest[address] = rest
             self.watch.junk_bytes += junk
             for frame in frames:
-                self.watch.take(t_us, frame)
+                if self._believed(frame, address, t_us):
+                    self.watch.take(t_us, frame)
         self.watch.pass_time(clock.wall_us())
         if self._requester is not None:
             self._requester.step(self.watch)
+
+    def _believed(self, frame: Frame, address: Address, t_us: int) -> bool:
+        """Whoever was heard first has its id until it is silent; another address with that id is said, and not shown."""
+        sender = (frame.system, frame.component)
+        home, heard_us = self._homes.get(sender, (address, t_us))
+        if home != address and t_us - heard_us < MOVED_S * 1e6:
+            self.watch.pass_time(t_us)
+            self.watch.stranger(sender, address)
+            return False
+        self._homes[sender] = (address, t_us)
+        return True
 
     @property
     def silent(self) -> bool:

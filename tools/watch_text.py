@@ -19,6 +19,7 @@ def status(watch: Watch, system: int | None = None) -> dict[str, Any]:
         "frames": watch.frames,
         "loss": round(watch.loss(), 6),
         "junk_bytes": watch.junk_bytes,
+        "strangers": watch.strangers,
     }
     if vehicle is None:
         return base | {"system": None}
@@ -91,6 +92,7 @@ def faults(watch: Watch, system: int | None = None) -> list[str]:
         found.append(f"{100 * loss:.1f} % of the frames lost, expected <= {100 * _MAX_LOSS:g} %")
     if vehicle.restarts:
         found.append(f"the autopilot restarted {vehicle.restarts} times")
+    found += [f"{words} ({frames} frames)" for words, frames in watch.strangers.items()]
     critical = [
         t
         for t in watch.texts

@@ -256,6 +256,46 @@ def test_gains_are_listed_read_and_changed_in_flight():
     assert any("PID_DAMPING = -4 refused" in t for t in loop.texts)
 
 
+@pytest.mark.parametrize("name", ["COMMAND_LONG", "COMMAND_INT"])
+def test_a_command_to_us_is_answered_known_or_not(name):
+    loop = Loop()
+    loop.until(lifecycle.OBSERVING)
+    for number, result in ((31_000, 3), (lifecycle.CMD_ENGAGE, 0)):
+        fields = (
+            (1, 191, number, 0, *(0.0,) * 7) if name == "COMMAND_LONG" else (1, 191, 0, number, 0, 0, *(0.0,) * 4, 0, 0, 0.0)
+        )
+        loop.take(wire.encode(name, fields, seq=0, system=255, component=190))
+        answers = [m for _, raw in loop.records[-3:] for _, m in wire.parse(raw) if type(m).__name__ == "COMMAND_ACK"]
+        assert (answers[-1].command, answers[-1].result, answers[-1].target_system) == (number, result, 255)
+    assert loop.flight.life.engage
+
+
+def test_a_parameter_that_we_do_not_have_is_refused_by_name_and_not_to_everybody():
+    loop = Loop()
+    loop.until(lifecycle.OBSERVING)
+
+    def errors(name, *fields):
+        count = len(loop.records)
+        loop.take(wire.encode(name, fields, seq=0, system=255, component=190))
+        said = [m for _, raw in loop.records[count:] for _, m in wire.parse(raw) if type(m).__name__ == "PARAM_ERROR"]
+        return [(m.target_system, m.param_id, m.param_index, m.error) for m in said]
+
+    assert errors("PARAM_REQUEST_READ", 1, 191, "NO_SUCH", -1) == [(255, "NO_SUCH", -1, 1)]
+    assert errors("PARAM_REQUEST_READ", 1, 191, "", 999) == [(255, "", 999, 1)]
+    assert errors("PARAM_SET", 1, 191, "NO_SUCH", 1.0, 9) == [(255, "NO_SUCH", -1, 1)]
+    assert errors("PARAM_REQUEST_READ", 1, 0, "NO_SUCH", -1) == []  # the autopilot may have it
+    assert errors("PARAM_REQUEST_READ", 1, 191, "", 0) == []
+
+
+def test_an_autopilot_that_answers_nothing_is_said():
+    """Telemetry that comes and requests that get nowhere: a link of one direction, a wrong target, a key."""
+    a = Autopilot()
+    a.muted = {"COMMAND_ACK"}
+    loop = Loop(autopilot=a)
+    loop.run(6.0)
+    assert loop.texts.count("mavquad: no answer to rate requests") == 1
+
+
 def test_an_ardupilot_that_takes_thrust_for_a_climb_rate_is_refused_with_the_parameter_to_set():
     loop = Loop()
     loop.until(lifecycle.OBSERVING)

@@ -170,6 +170,14 @@ def test_thrust_options_that_nobody_tells_are_no_reason_to_fly():
     assert not a.armed
 
 
+@pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan])
+def test_thrust_options_that_are_no_number_are_as_good_as_none(value):
+    loop = asked_to_engage(ArduCopter(GUID_OPTIONS=value))
+    loop.until(lifecycle.RELEASED)
+    assert loop.flight.life.reason == "GUID_OPTIONS cannot be read"
+    assert loop.flight.counts["PARAM_VALUE refused"] > 0
+
+
 def test_a_failsafe_that_takes_the_vehicle_home_is_named_and_not_fought():
     loop = engaged(ArduCopter())
     loop.autopilot.say("GCS Failsafe")

@@ -6,16 +6,17 @@ import math
 
 import pytest
 
-from mavquad import lifecycle, pipeline, wire
+from mavquad import lifecycle, pipeline, strangers, wire
 from mavquad.companion import request
 from mavquad.link import tlog
 from mavquad.link.endpoint import open_endpoint
 from mavquad.link.signing import Memory, Signer
 from mavquad.paths import Path
+from mavquad.relay import Relay
 from mavquad.settings import Companion
 from tests.oracles.autopilot import Autopilot
 from tests.oracles.client import Client
-from tests.oracles.desk import EPOCH_US, HERE, THERE, Desk
+from tests.oracles.desk import EPOCH_US, HERE, THERE, Desk, Endpoint
 from tools import __main__ as tools_main
 from tools import playback
 
@@ -81,14 +82,55 @@ def unmoved(desk):
     ],
     ids=("vehicle 2", "vehicle 2 here", "attitude", "heartbeat", "port", "ack", "ourselves"),
 )
-def test_a_stranger_changes_nothing_is_counted_and_kept(table, raw, address, reason):
+def test_a_stranger_changes_nothing_is_said_once_counted_and_kept(table, raw, address, reason, capsys):
     desk = engaged(table)
-    before = unmoved(desk)
+    before, seen = unmoved(desk)[:4], len(desk.texts)
+    capsys.readouterr()
+    desk.give(raw, address)
+    shown = [f"mavquad: refused 1/{raw[6]} from {address[0]}:{address[1]}"] if reason in strangers.POSING else []
+    assert desk.texts[seen:] == shown  # every monitor and ground station sees it
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 1
+    assert f"of {raw[5]}/{raw[6]} from {address[0]}:{address[1]}: {reason}" in told[0]
+    once = unmoved(desk)
+    assert once[:4] == before
     assert desk.give(raw, address) == b""
-    assert unmoved(desk) == before
-    assert desk.companion.refused == {reason: 1}
-    assert [frame.raw for frame in desk.logged("refused")] == [raw]
+    assert unmoved(desk) == once
+    assert capsys.readouterr().err == ""
+    assert desk.companion.refused == {reason: 2}
+    assert [frame.raw for frame in desk.logged("refused")] == [raw, raw]
     assert raw not in [frame.raw for frame in desk.logged()]
+
+
+def test_a_flight_in_which_somebody_posed_replays_bit_for_bit(table):
+    desk = engaged(table)
+    desk.give(heartbeat(armed=False), THERE)
+    desk.serve(1.0)
+    assert "mavquad: refused 1/1 from 192.0.2.66:6666" in desk.texts
+    with desk.companion.log.path.open("rb") as stream:
+        verdict = playback.verify(pipeline.build(QUICK), list(tlog.read(stream)), own=(1, 191))
+    assert verdict.parting is None
+    assert verdict.sent > 100
+
+
+def test_a_ground_station_behind_us_is_not_sent_what_strangers_say(table):
+    desk = engaged(table)
+    station = Endpoint()
+    desk.companion.relays = (Relay(station, "udpout:192.0.2.2:14550"),)
+    desk.companion._frames(heartbeat(armed=False), THERE)
+    assert station.sent == []
+    desk.companion._frames(heartbeat(), HERE)
+    assert station.sent == [heartbeat()]
+
+
+def test_nobody_on_the_network_can_put_words_into_the_companions_mouth(table):
+    desk = engaged(table)
+    seen = len(desk.texts)
+    note = strangers.notice(wire.split(heartbeat())[0][0], THERE).raw
+    desk.give(note, THERE)
+    desk.give(note, HERE)
+    assert desk.texts[seen:] == []
+    assert desk.companion.refused == {"not from our autopilot": 2}
 
 
 def test_another_vehicles_heartbeat_is_heard_and_changes_nothing_of_the_flight(table):

@@ -236,6 +236,40 @@ def test_a_live_link_is_watched_and_nothing_is_sent(live):
     assert feed.status().startswith("live udpin")
 
 
+def test_an_id_from_a_second_address_is_said_and_not_shown(live):
+    """A spoofed HEARTBEAT: the vehicle stays as it was, and whoever looks is told."""
+    feed, peer = live
+    raws = [raw for _, raw in flown.frames(1.0)]
+    peer.send(*raws[:5])
+    wait(feed, lambda: feed.watch.frames == 5)
+    mode = feed.watch.vehicles[1].mode
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        forged = wire.encode("HEARTBEAT", (2, 12, 0, 4 << 16 | 6 << 24, 4, 3), seq=9, system=1, component=1)
+        aside = wire.encode("HEARTBEAT", (18, 8, 0, 0, 4, 3), seq=0, system=7, component=191)
+        to = ("127.0.0.1", int(feed._endpoint.name.rpartition(":")[2]))
+        other.sendto(forged + forged + aside, to)
+        wait(feed, lambda: feed.watch.frames == 6)  # who has an id of its own is heard from wherever
+        words = f"1/1 from 127.0.0.1:{other.getsockname()[1]} too"
+        assert feed.watch.strangers == {words: 2}
+        assert feed.watch.vehicles[1].mode == mode
+        assert [text.words for text in feed.watch.texts if text.sender == "monitor"] == [
+            f"{words}: two have one id, or somebody poses; not shown"
+        ]
+        assert f"{words} (2 frames)" in watch_text.verdict(feed.watch)
+        feed._homes[1, 1] = (feed._homes[1, 1][0], 0)  # silent for long: it may have moved
+        other.sendto(forged, to)
+        wait(feed, lambda: feed.watch.frames == 7)
+    assert feed.watch.vehicles[1].mode == "AUTO.LAND"
+
+
+def test_strangers_by_the_thousand_are_not_all_named():
+    watch = Watch()
+    for port in range(2000):
+        watch.stranger((1, 1), ("192.0.2.1", port))
+    assert len(watch.strangers) == len(watch.texts) == 16
+
+
 @pytest.mark.parametrize("live", [(True,)], indirect=True)
 def test_rates_are_requested_only_when_asked_for_and_the_answers_shown(live):
     feed, peer = live
