@@ -9,7 +9,7 @@ import math
 import zlib
 from collections.abc import Iterable
 
-from mavquad import control_step, lifecycle, messages, outbox, publish, samples, strangers, wire
+from mavquad import control_step, delayed, lifecycle, messages, outbox, publish, samples, strangers, wire
 from mavquad.flight import Flight, start
 from mavquad.lifecycle import ENGAGED, STREAMING
 from mavquad.plan import Plan, build
@@ -164,7 +164,20 @@ def _tick(plan: Plan, f: Flight, now_us: int) -> None:
             control_step.hold(plan, f, 1e-6 * _TICK_US, level=age > safety.level_s)
         elif f.late_us and now_us - f.late_us > 500_000:
             outbox.release(plan, f, "this companion is too late")
+        _adapt(plan, f)
         _bounds(plan, f, p)
+
+
+def _adapt(plan: Plan, f: Flight) -> None:
+    """A controller that the link's delay would make oscillate flies slower."""
+    now = f.tuned or plan
+    adapted = delayed.adapt(now, f.delay_s)
+    if adapted is not now:
+        f.tuned = adapted
+        slow = delayed.slowed(adapted)
+        outbox.say(
+            plan, f, f"delay of {1e3 * f.delay_s:.0f} ms, {'flying slower' if slow else 'in time again'}", 4 if slow else 6
+        )
 
 
 def _bounds(plan: Plan, f: Flight, p: Vec3) -> None:

@@ -39,10 +39,14 @@ def designs(module: Any, params: Any, airframe: Airframe) -> tuple[Any, ...]:
     return tuple(_design(module, params, airframe, late_s) for late_s in LATE_S)
 
 
+def own_s(airframe: Airframe) -> float:
+    """What the vehicle's own attitude response takes, with the margin of the controllers' rules."""
+    return airframe.attitude.lag_s + airframe.attitude.delay_s + _MARGIN_S
+
+
 def _design(module: Any, params: Any, airframe: Airframe, late_s: float) -> Any:
-    response = airframe.attitude
-    own_s, more_s = response.lag_s + response.delay_s + _MARGIN_S, _MEAN * late_s
-    slower = own_s / (own_s + more_s)
+    response, own, more_s = airframe.attitude, own_s(airframe), _MEAN * late_s
+    slower = own / (own + more_s)
     changed: dict[str, float] = {}
     for field in dataclasses.fields(params):
         value = getattr(params, field.name)

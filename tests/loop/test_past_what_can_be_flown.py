@@ -4,8 +4,9 @@ import math
 
 import pytest
 
-from mavquad import control_step, lifecycle
+from mavquad import control_step, delayed, lifecycle, tunables
 from mavquad.paths import Path
+from mavquad.plan import build
 from mavquad.settings import Companion
 from tests.oracles.late import Late
 
@@ -31,3 +32,35 @@ def test_a_delay_that_cannot_be_flown_is_said_and_landed(delay_ms, lands):
     said = any("ms cannot be flown, landing" in text for text in late.texts)
     assert said == lands
     assert (late.life.state != lifecycle.ENGAGED) == lands
+
+
+def test_a_long_delay_without_prediction_is_flown_slower_and_not_in_circles():
+    """As designed `pid` flies circles of up to four metres around its path with this delay; who predicts flies on as designed."""
+    late = flight("link.delay_ms=220").engage().run(22.0)
+    assert late.life.state == lifecycle.ENGAGED
+    assert [text for text in late.texts if "slower" in text or "in time" in text] == [
+        f"mavquad: delay of {1e3 * late.flight.delay_s:.0f} ms, flying slower"
+    ]
+    errors = [
+        math.dist(control_step.demand_at(late.plan, late.flight, round(1e6 * t_s)).p_ned_m, p)
+        for t_s, *p in late.truth
+        if 1e6 * t_s > late.flight.path_t0_us
+    ]
+    assert len(errors) > 8000
+    assert max(errors) < 1.0
+
+
+def test_the_slowest_design_is_for_those_who_do_not_predict_and_goes_with_the_delay():
+    pid = build(Companion(controller="pid", observers=()))
+    assert delayed.adapt(pid, 0.2) is pid
+    slow = delayed.adapt(pid, 0.3)
+    assert slow.controller.gains == pid.slowed[-1]
+    assert slow.slowed == (pid.slowed[-1],) * 3
+    assert delayed.adapt(slow, 0.2) is slow  # between the two limits nothing changes
+    quick = delayed.adapt(slow, 0.1)
+    assert (quick.controller, quick.slowed) == (pid.controller, pid.slowed)
+    changed = tunables.change(slow, "PID_DAMPING", 1.2)  # in flight: as it says, and slow again at the next tick
+    assert delayed.adapt(changed, 0.3).controller.gains == changed.slowed[-1]
+    for name in ("iadrc", "eskf-mpc", "autopilot"):
+        other = build(Companion(controller=name, observers=()))
+        assert delayed.adapt(other, 0.45) is other
