@@ -10,7 +10,7 @@ from fastcrc.crc16 import mcrf4xx
 from mavquad import wire
 
 _EDGES = (0x00, 0x01, 0x7F, 0x80, 0xFD, 0xFE, 0xFF)
-_FLOATS = tuple(
+FLOATS = tuple(
     struct.pack("<f", x) for x in (math.nan, math.inf, -math.inf, 0.0, -0.0, 1e38, -1e38, 1e-38, 1.0, -1.0, 4.2e9, 1e6, 3e-45)
 )
 _WORDS = (
@@ -47,7 +47,7 @@ def data(rng: random.Random, raw: bytes, times: int = 0) -> bytes:
         elif kind == 1:
             out[at] = rng.choice(_EDGES)
         elif kind == 2:
-            out[at : at + 4] = rng.choice(_FLOATS)
+            out[at : at + 4] = rng.choice(FLOATS)
         elif kind == 3:
             del out[at : at + 1 + rng.randrange(12)]
         elif kind == 4:
@@ -68,7 +68,7 @@ def sealed(rng: random.Random, raw: bytes) -> bytes:
         at = rng.randrange(len(payload))
         if rng.random() < 0.6:
             at = at // 4 * 4
-            payload[at : at + 4] = rng.choice(_FLOATS)
+            payload[at : at + 4] = rng.choice(FLOATS)
         else:
             payload[at] = rng.getrandbits(8)
     if rng.random() < 0.1:

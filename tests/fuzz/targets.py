@@ -5,16 +5,18 @@ be on the wire (a setpoint that is not finite, not a rotation, outside the limit
 """
 
 import contextlib
+import functools
 import io
 import math
 import random
+import struct
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from mavquad import airframe, config, lifecycle, pipeline, wire
+from mavquad import airframe, config, lifecycle, pipeline, tunables, wire
 from mavquad.companion import request
 from mavquad.errors import ConfigError, LogError, WireError
 from mavquad.link import columns, tlog
@@ -23,6 +25,9 @@ from mavquad.settings import Companion
 from sitl import config as sitl_config
 from sitl import simulation
 from tests.fuzz import mutate
+from tests.loop.test_companion_loop import Loop  # the scripted autopilot's loop
+from tests.oracles.arducopter import ArduCopter
+from tests.oracles.autopilot import Autopilot
 from tools import __main__ as commands
 
 ROOT = Path(__file__).parents[2]
@@ -73,11 +78,9 @@ def frames(chance: random.Random) -> int:
 class _Engaged:
     """A companion in the middle of a flight, made once; the pipeline never changes a state that it was given."""
 
-    def __init__(self) -> None:
-        from tests.loop.test_companion_loop import Loop  # the scripted autopilot's loop
-
-        settings = Companion(path=Line(name="hover", duration_s=600.0), observers=("gsmo",))
-        loop = Loop(settings)
+    def __init__(self, controller: str, autopilot: Autopilot) -> None:
+        settings = Companion(path=Line(name="hover", duration_s=600.0), observers=("gsmo",), controller=controller)
+        loop = Loop(settings, autopilot)
         self.states = []
         loop.run(0.5)
         self.states.append(loop.flight.clone())
@@ -89,12 +92,16 @@ class _Engaged:
         loop.until(lifecycle.ENGAGED)
         loop.run(1.0)
         self.states.append(loop.flight.clone())
-        self.plan, self.autopilot = loop.plan, loop.autopilot
-        self.now_us = loop.flight.arrival_us
+        self.plan = loop.plan
+        self.names = [t.name for t in tunables.tunables(loop.plan)]
         self.boot_ms = loop.autopilot.t_us // 1000
 
 
-_engaged: list[_Engaged] = []
+@functools.cache
+def _engaged(ardupilot: bool) -> _Engaged:
+    return _Engaged("eskf-mpc", ArduCopter()) if ardupilot else _Engaged("pid", Autopilot())
+
+
 _HEARD = [
     wire.ID[name] for name in ("ATTITUDE_QUATERNION", "ATTITUDE", "LOCAL_POSITION_NED", "HIGHRES_IMU", "SERVO_OUTPUT_RAW")
 ]
@@ -103,9 +110,7 @@ _SETPOINTS = (wire.ID["SET_ATTITUDE_TARGET"], wire.ID["SET_POSITION_TARGET_LOCAL
 
 def handlers(chance: random.Random) -> int:
     """The pipeline: frames whose CRC is right and whose fields are junk, among good ones, in every state of its life."""
-    if not _engaged:
-        _engaged.append(_Engaged())
-    start = _engaged[0]
+    start = _engaged(chance.random() < 0.5)
     plan, count = start.plan, 0
     raws = [raw for raw in BANK if int.from_bytes(raw[7:10], "little") in pipeline_ids(plan)]
     for before in start.states:
@@ -113,9 +118,10 @@ def handlers(chance: random.Random) -> int:
         for step in range(BATCH // len(start.states)):
             now_us += chance.randrange(20_000)
             boot_ms += 8
-            raw = mutate.sealed(chance, chance.choice(raws))
             if step % 4 == 0:
                 raw = _sample(chance, boot_ms)
+            else:
+                raw = mutate.sealed(chance, chance.choice(raws)) if step % 4 < 3 else _words(chance, start.names)
             for frame in wire.split(raw)[0]:
                 if pipeline.accepts(plan, flight, frame):
                     continue
@@ -127,6 +133,26 @@ def handlers(chance: random.Random) -> int:
         judge_outbox(plan.settings, flight.outbox)
         flight.outbox, flight.trace = [], []
     return count
+
+
+def _words(chance: random.Random, names: list[str]) -> bytes:
+    """What only works with the right names and numbers, so that bytes by chance never say it."""
+    value = struct.unpack("<f", chance.choice(mutate.FLOATS))[0]
+    kind = chance.randrange(5)
+    if kind == 0:
+        name = chance.choice(("GUID_OPTIONS", "MOT_THST_HOVER", "MPC_THR_HOVER"))
+        return wire.encode("PARAM_VALUE", (name, value, chance.choice((6, 9)), 1, 0), seq=0, system=1, component=1)
+    if kind == 1:
+        answer = (chance.choice((400, 22, 176, 21, 511, 512)), chance.randrange(9), 0, 0, 1, 191)
+        return wire.encode("COMMAND_ACK", answer, seq=0, system=1, component=1)
+    if kind == 2:
+        mode = chance.choice((6 << 16, 4 << 16 | 3 << 24, 4, 6, 9, 0xFFFFFFFF))
+        beat = (2, chance.choice((3, 12, 0, 255)), chance.choice((0, 128, 255)), mode, 4, 3)
+        return wire.encode("HEARTBEAT", beat, seq=0, system=1, component=1)
+    if kind == 3:
+        return wire.encode("PARAM_SET", (1, 191, chance.choice(names), value, 9), seq=0, system=255, component=190)
+    asked = (1, 191, chance.choice((lifecycle.CMD_ENGAGE, lifecycle.CMD_LAND, 1)), 0, *(value,) * 7)
+    return wire.encode("COMMAND_LONG", asked, seq=0, system=255, component=190)
 
 
 def pipeline_ids(plan: pipeline.Plan) -> set[int]:
