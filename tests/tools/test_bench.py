@@ -55,21 +55,23 @@ def test_cpu_time_is_that_of_the_work():
     assert cpu_s(lambda: None) < cpu_s(lambda: sum(range(200_000)))
 
 
-def test_the_live_contestants_fly_the_same_setpoint():
+def test_the_live_contestants_fly_the_same_setpoint(tmp_path):
     told = []
     with live._bound() as vehicle:
         vehicle.settimeout(60.0)
-        for kind in (live._OurLoop, live._MavutilLoop):
-            loop = kind(vehicle.getsockname()[1])
+        for kind in (live._OurLoop, live._PipelineLoop, live._MavutilLoop):
+            (tmp_path / kind.__name__).mkdir()
+            loop = kind(vehicle.getsockname()[1], tmp_path / kind.__name__)
             for k in (30, 31, 32):
                 vehicle.sendto(b"".join(live.telemetry(k)), loop.sock.getsockname())
                 loop.turn(k)
                 (frame,) = wire.split(vehicle.recv(2048))[0]
-            loop.sock.close()
+            loop.close()
             told.append(wire.decode(frame))
-    assert told[0].time_boot_ms == told[1].time_boot_ms == 256
-    assert told[0].thrust == pytest.approx(told[1].thrust, abs=1e-3)
-    assert told[0].q == pytest.approx(told[1].q, abs=1e-2)
+    assert told[0] == told[1]
+    assert told[0].time_boot_ms == told[2].time_boot_ms == 256
+    assert told[0].thrust == pytest.approx(told[2].thrust, abs=1e-3)
+    assert told[0].q == pytest.approx(told[2].q, abs=1e-2)
 
 
 def test_the_limit_in_c_and_a_missing_peer_are_rows_whatever_happens(monkeypatch):

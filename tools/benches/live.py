@@ -5,6 +5,7 @@ controller on the same telemetry over a loopback UDP socket, in one thread: what
 the answer has. The composed tick is CPU time.
 """
 
+import contextlib
 import math
 import os
 import signal
@@ -20,20 +21,23 @@ from typing import Any
 
 import numpy as np
 
-from mavquad import config, control_step, lifecycle, paths, pipeline, realtime, wire
+from mavquad import config, control_step, lane, lifecycle, paths, pipeline, realtime, wire
 from mavquad import flight as flights
 from mavquad import plan as plans
-from mavquad.errors import ConfigError
+from mavquad.errors import ConfigError, FlightError
+from mavquad.link import health, signals, tlog
 from mavquad.plan import Plan
+from mavquad.run_files import TraceWriter
 from mavquad.setpoint import attitude, limits
 from mavquad.settings import Companion
-from mavquad.signals import ZERO3, Attitude, Demand, Position, Setpoint
+from mavquad.signals import NAN3, ZERO3, Applied, Attitude, Demand, Position, Setpoint
 from tools import fused_tick
 from tools.benches import Row
 
 _ROUNDS = 15
 _DT_US = 8000
 _HASTY = "ours, --realtime"
+_NEVER_US = 1 << 62
 
 
 def measure(seconds: float) -> list[Row]:
@@ -99,25 +103,35 @@ def telemetry(k: int, first: bool = False) -> list[bytes]:
 
 
 class _OurLoop:
-    """Datagram in, `pipeline`, datagram out: what the companion does between its socket calls."""
+    """Datagram in, log and trace, datagram out: what the companion does between its socket calls."""
 
-    def __init__(self, port: int) -> None:
-        self.plan, self.flight = hovering(controller="pid")
+    def __init__(self, port: int, folder: Path) -> None:
+        plan, flight = hovering(controller="pid")
+        self.lane = lane.Lane(plan, False)
+        if not self.lane.enter(flight, health.Source(0, 1, 0)):
+            raise FlightError("the fast lane does not take a hover: a bug of the bench")
+        self.log, self.trace = tlog.Writer(folder / "flight.tlog"), TraceWriter(folder / "flight.trace", plan.trace_names)
         self.sock = _bound()
         self.to = ("127.0.0.1", port)
 
     def turn(self, k: int) -> None:
-        data = self.sock.recv(2048)
-        self.flight = pipeline.feed_all(self.plan, self.flight, k * _DT_US + 5000, wire.split(data)[0])
-        for _, raw in self.flight.outbox:
-            if raw[7] == 82:  # SET_ATTITUDE_TARGET
-                self.sock.sendto(raw, self.to)
+        fast, stamp_us = self.lane, k * _DT_US + 5000
+        if fast.feed(self.sock.recv(2048), stamp_us, _NEVER_US) != lane.DONE:
+            raise FlightError("plain telemetry was not taken by the fast lane: a bug of the bench")
+        self.log.write_bytes(stamp_us, fast.log)
+        self.trace.write_bytes(fast.trace)
+        self.sock.sendto(fast.sent, self.to)
+
+    def close(self) -> None:
+        self.sock.close()
+        self.log.close()
+        self.trace.close()
 
 
 class _MavutilLoop:
     """The same stages called from a loop as people write it with pymavlink.mavutil."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port: int, folder: Path) -> None:
         from pymavlink import mavutil
 
         self.plan, _ = hovering(controller="pid")
@@ -154,82 +168,170 @@ class _MavutilLoop:
         self.sent, _ = limits.apply(plan.limits, self.sent, wanted, 1e-6 * _DT_US)
         self.link.mav.set_attitude_target_send(m.time_boot_ms, 1, 1, 7, self.sent.q_wxyz, 0, 0, 0, self.sent.thrust)
 
+    def close(self) -> None:
+        self.link.close()
+
     def _observe(self, sample: Any) -> None:
         self.estimator = self.plan.estimator.module.observe(self.plan.estimator.gains, self.estimator, sample)
+
+
+class _PipelineLoop:
+    """The same through the pipeline, as a companion flies every other controller; without log and trace."""
+
+    def __init__(self, port: int, folder: Path) -> None:
+        self.plan, self.flight = hovering(controller="pid")
+        self.sock = _bound()
+        self.to = ("127.0.0.1", port)
+
+    def turn(self, k: int) -> None:
+        data = self.sock.recv(2048)
+        self.flight = pipeline.feed_all(self.plan, self.flight, k * _DT_US + 5000, wire.split(data)[0])
+        for _, raw in self.flight.outbox:
+            if raw[7] == 82:  # SET_ATTITUDE_TARGET
+                self.sock.sendto(raw, self.to)
+
+    def close(self) -> None:
+        self.sock.close()
+
+
+_LOOPS = {"ours": _OurLoop, _HASTY: _OurLoop, "ours, stage by stage": _PipelineLoop, "pymavlink.mavutil": _MavutilLoop}
 
 
 def loops(seconds: float) -> list[Row]:
     """IMU and attitude in, setpoint out, over a socket."""
     many = max(50, round(30 * seconds))
-    rows, us = [], {}
-    with _bound() as vehicle:
-        for who, kind in (("ours", _OurLoop), (_HASTY, _OurLoop), ("pymavlink.mavutil", _MavutilLoop)):
-            if who == _HASTY:
-                try:
-                    realtime.ask()
-                except ConfigError as error:
-                    rows.append(Row("IMU in to setpoint out, p99", who, math.nan, "us", str(error)))
-                    continue
-            loop = kind(vehicle.getsockname()[1])
-            where = loop.sock.getsockname()
-            times: list[list[float]] = []
-            k = 30
-            for round_ in range(_ROUNDS + 1):
-                spent = []
-                for _ in range(many):
-                    vehicle.sendto(b"".join(telemetry(k)), where)
-                    begun = time.perf_counter_ns()
-                    loop.turn(k)
-                    spent.append(1e-3 * (time.perf_counter_ns() - begun))
-                    vehicle.recv(2048)
-                    k += 1
+    rows: list[Row] = []
+    refused = ""
+    spent: dict[str, list[list[float]]] = {who: [] for who in _LOOPS}
+    with _bound() as vehicle, tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as ending:
+        there: dict[str, Any] = {}
+        for i, (who, kind) in enumerate(_LOOPS.items()):
+            (Path(folder) / str(i)).mkdir()
+            there[who] = kind(vehicle.getsockname()[1], Path(folder) / str(i))
+            ending.callback(there[who].close)
+        for round_ in range(_ROUNDS + 1):
+            for who, loop in there.items():
+                if who == _HASTY:
+                    try:
+                        realtime.ask()
+                    except ConfigError as error:
+                        refused = str(error)
+                        continue
+                times = _turns(vehicle, loop, 30 + many * round_, many)
+                if who == _HASTY:
+                    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
                 if round_:  # the first warms up
-                    times.append(spent)
-            loop.sock.close()
-            if who == _HASTY:
-                os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-            us[who] = [statistics.median(spent) for spent in times]
-            rows.append(_row("IMU in to setpoint out, p50", who, us[who], "us"))
-            rows.append(_row("IMU in to setpoint out, p99", who, [float(np.percentile(spent, 99)) for spent in times], "us"))
+                    spent[who].append(times)
+    if refused:
+        rows.append(Row("IMU in to setpoint out, p99", _HASTY, math.nan, "us", refused))
+    us = {who: [statistics.median(times) for times in all_] for who, all_ in spent.items() if all_}
+    for who in us:
+        rows.append(_row("IMU in to setpoint out, p50", who, us[who], "us"))
+        rows.append(_row("IMU in to setpoint out, p99", who, [float(np.percentile(times, 99)) for times in spent[who]], "us"))
     return [*rows, _times("IMU in to setpoint out, p50", us, "pymavlink.mavutil")]
 
 
+def _turns(vehicle: socket.socket, loop: Any, first: int, many: int) -> list[float]:
+    """How long [us] each of many turns took, from control period `first` on."""
+    where, times = loop.sock.getsockname(), []
+    for k in range(first, first + many):
+        vehicle.sendto(b"".join(telemetry(k)), where)
+        begun = time.perf_counter_ns()
+        loop.turn(k)
+        times.append(1e-3 * (time.perf_counter_ns() - begun))
+        vehicle.recv(2048)
+    return times
+
+
 # ---- a composed tick --------------------------------------------------------------------------------------------------------
-_MPC = {"controller": "eskf-mpc", "estimator": "joint", "tune": {"eskf-mpc": {"constrained": "off"}}}
-_MPC_ASMF = {**_MPC, "compensator": "asmf"}
+_MPC = "EKF + closed-form MPC"
+_TUNED = {"controller": "eskf-mpc", "estimator": "joint", "tune": {"eskf-mpc": {"constrained": "off"}}}
+_TUNED_ASMF = {**_TUNED, "compensator": "asmf"}
 
 
 def composed(seconds: float) -> list[Row]:
-    """Decode, EKF, closed-form MPC, ASMF, encode: CPU time of one control period, staged and as one compiled function."""
-    what, note, rows = "decode, estimate, control, encode: one tick", "2.3 messages in", []
-    for who, chosen in (
-        ("pid", {"controller": "pid"}),
-        ("EKF + closed-form MPC", _MPC),
-        ("EKF + closed-form MPC + ASMF", _MPC_ASMF),
-    ):
-        plan, flight = hovering(**chosen)
+    """Decode, EKF, closed-form MPC, ASMF, encode: CPU time of one control period; the stages alone, in the pipeline, and as one function."""
+    what, rows = "decode, estimate, control, encode: one tick", []
+    note = "2.3 messages in"
+    for who, chosen in (("pid", {"controller": "pid"}), (_MPC, _TUNED), (f"{_MPC} + ASMF", _TUNED_ASMF)):
+        tick = _Composed(*hovering(**chosen))
+        rows.append(_row(what, who, _cpu_per_tick(tick.turn, seconds), "us CPU", f"stages called from Python, {note}"))
+    plan, flight = hovering(**_TUNED_ASMF)
 
-        def staged(k: int, data: bytes) -> None:
-            nonlocal flight
-            flight = pipeline.feed_all(plan, flight, k * _DT_US + 5000, wire.split(data)[0])  # noqa: B023 # called at once
+    def piped(k: int, data: bytes) -> None:
+        nonlocal flight
+        flight = pipeline.feed_all(plan, flight, k * _DT_US + 5000, wire.split(data)[0])
 
-        rows.append(_row(what, who, _cpu_per_tick(staged, seconds), "us CPU", f"stages called from Python, {note}"))
-    fused = fused_tick.Tick(*hovering(**_MPC_ASMF))
+    rows.append(
+        _row(
+            what,
+            f"{_MPC} + ASMF, pipeline",
+            _cpu_per_tick(piped, seconds),
+            "us CPU",
+            f"and the companion's book-keeping, {note}",
+        )
+    )
+    fused = fused_tick.Tick(*hovering(**_TUNED_ASMF))
     spent = _cpu_per_tick(lambda k, data: fused.feed(wire.split(data)[0]), seconds)
-    rows.append(_row(what, "EKF + closed-form MPC + ASMF, fused", spent, "us CPU", f"one compiled function, {note}"))
+    rows.append(_row(what, f"{_MPC} + ASMF, fused", spent, "us CPU", f"one compiled function, {note}"))
     return rows
 
 
+class _Composed:
+    """The stages of a plan one after the other, between decoding and encoding."""
+
+    def __init__(self, plan: Plan, flight: pipeline.Flight) -> None:
+        self.plan, self.f = plan, flight.clone()
+        assert flight.sent is not None
+        self.sent, self.control_us = flight.sent, flight.control_us
+
+    def turn(self, k: int, data: bytes) -> None:
+        plan, f = self.plan, self.f
+        for frame in wire.split(data)[0]:
+            name = plan.samples.get(frame.msgid)
+            if name is None or (name == "HIGHRES_IMU" and plan.imu_spared):
+                continue
+            sample = signals.DECODERS[name](wire.decode(frame))
+            f.estimator = plan.estimator.module.observe(plan.estimator.gains, f.estimator, sample)
+            if plan.compensator is not None:
+                f.compensator = plan.compensator.module.observe(plan.compensator.gains, f.compensator, sample)
+            if type(sample) is Attitude:
+                self._step(sample.t_us)
+
+    def _step(self, t_us: int) -> None:
+        plan, f, last = self.plan, self.f, self.sent
+        dt_s, self.control_us = 1e-6 * (t_us - self.control_us), t_us
+        thrust_m_s2 = attitude.G_M_S2 * last.thrust / f.hover_thrust
+        applied = Applied(t_us, last.q_wxyz, thrust_m_s2, NAN3, f.delay_s, 0.0, last.thrust)
+        f.estimator, estimate = plan.estimator.module.step(plan.estimator.gains, f.estimator, applied, t_us)
+
+        def ahead(t_us: int) -> Demand:
+            return control_step.demand_at(plan, f, t_us)
+
+        f.controller, command = plan.controller.module.step(
+            plan.controller.gains, f.controller, estimate, ahead(t_us), ahead, dt_s
+        )
+        if plan.compensator is not None:
+            f.compensator, command = plan.compensator.module.step(
+                plan.compensator.gains, f.compensator, estimate, command, applied, t_us, ahead
+            )
+        q, size, _ = attitude.pointing(command.a_ned_m_s2, command.yaw_rad, plan.limits.tilt_rad)
+        wanted = Setpoint(q, ZERO3, f.hover_thrust * size / attitude.G_M_S2, 7)
+        self.sent, _ = limits.apply(plan.limits, last, wanted, dt_s)
+        fields = signals.attitude_setpoint(t_us // 1000, 1, 1, self.sent)
+        wire.encode("SET_ATTITUDE_TARGET", fields, seq=0, system=1, component=191)
+
+
 def _cpu_per_tick(turn: Callable[[int, bytes], object], seconds: float) -> list[float]:
-    """CPU time [us] of a tick, by rounds; one round before that warms up."""
+    """CPU time [us] of a tick, by rounds; one round before that warms up. Of this thread: a process's comes in steps of a timer tick."""
     many, k, per_tick = max(25, round(10 * seconds)), 30, []
     for round_ in range(_ROUNDS + 1):
         frames = [b"".join(telemetry(k + i)) for i in range(many)]
-        begun = time.process_time_ns()
+        begun = time.thread_time_ns()
         for i, data in enumerate(frames):
             turn(k + i, data)
         if round_:
-            per_tick.append(1e-3 * (time.process_time_ns() - begun) / many)
+            per_tick.append(1e-3 * (time.thread_time_ns() - begun) / many)
         k += many
     return per_tick
 
