@@ -92,6 +92,7 @@ class ArduPilot(Autopilot):
     # mission float + int, command int, param float, attitude and local position setpoints, MAVLink 2
     capabilities = 1 | 2 | 4 | 8 | 64 | 128 | 8192
     version = 0x04070000
+    shapes = True
     rate_limit_hz = 200.0
     rate_denied = DENIED
     refusal = FAILED
@@ -134,7 +135,7 @@ class ArduPilot(Autopilot):
         return self.armed and self.task == "external"
 
     def attitude_echo(self) -> tuple[Any, ...]:
-        state = self.vehicle.state.view  # the target after shaping, not what was sent
+        state = self.vehicle.state.view
         q = rotation.to_quaternion(tuple(state["shaped_R"].tolist()))
         return 0, q, *state["shaped_rates_rad_s"].tolist(), state["thrust"].item()
 

@@ -40,6 +40,7 @@ class Autopilot(ABC):
     version = 0
     rate_limit_hz = 1000.0  # more is refused
     rate_denied = FAILED  # a rate for a message that is not there
+    shapes = False  # ATTITUDE_TARGET tells the target after shaping, not what was sent
     refusal = TEMPORARILY_REJECTED  # of arming and disarming
     denied = "Arming denied"  # how a reason begins
     timesync_us = 0  # how often it asks for the time unless in lockstep; 0 never

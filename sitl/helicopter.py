@@ -277,9 +277,12 @@ class Helicopter(Vehicle):
         self.heli["every"] = round(TICK_S * sitl.rate_hz)
         self.heli["scheduled"] = 1
 
+    @property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        return self.state.array, self.setpoint.array, self.constants.array, self.heli.array, self._gusts, self._normals
+
     def actuate(self, steps: int) -> None:
-        arrays = (self.state.array, self.setpoint.array, self.constants.array, self.heli.array, self._gusts, self._normals)
-        advance(*arrays, steps)
+        advance(*self.arrays, steps)
 
     def give_sticks(self, lat: float, lon: float, ped: float, col: float) -> None:
         """Sticks in place of the inner loop, while the setpoint's kind is STICKS."""

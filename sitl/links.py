@@ -13,11 +13,16 @@ from typing import Any
 import numpy as np
 
 from mavquad import wire
-from sitl import config
+from sitl import config, frames
+from sitl.frames import DATAGRAM, NEVER
+from sitl.ring import Ring
 
-DATAGRAM = 1400  # bytes at most
-NEVER = 1 << 62
 Message = tuple[str, tuple[Any, ...]]  # name and fields, not yet a frame
+
+
+def faulty(link: config.Link) -> bool:
+    """Whether the wire may do more to a frame than hold it back."""
+    return bool(link.loss or link.duplicate or link.reorder or link.corrupt or link.silences)
 
 
 class Queue:
@@ -30,7 +35,7 @@ class Queue:
         self._rng, self._chance = rng, rng.spawn(1)[0]  # of what is put in and of what comes out: neither waits for the other
         self._delay_us, self._jitter_us = round(1000.0 * link.delay_ms), 1000.0 * link.jitter_ms
         self._silences = [(round(1e6 * a), round(1e6 * b)) for a, b in link.silences]
-        self.faulty = bool(link.loss or link.duplicate or link.reorder or link.corrupt or self._silences)
+        self.faulty = faulty(link)
         self._waiting: deque[tuple[int, Any]] = deque()
         self._held: list[tuple[int, int, bytes]] = []
         self._latest_us = self._holds = 0
@@ -84,7 +89,7 @@ class Queue:
 class Stream:
     """One message that is sent again and again: `build()` gives its fields, or None when there is nothing to say."""
 
-    __slots__ = ("build", "due_us", "interval_us", "msgid", "name", "rank")
+    __slots__ = ("build", "due_us", "interval_us", "msgid", "name", "rank")  # due_us: unless a `Ring` keeps it
 
     def __init__(self, name: str, rank: int, build: Callable[[], tuple[Any, ...] | None]) -> None:
         self.name, self.rank, self.build = name, rank, build
@@ -99,27 +104,40 @@ class Stream:
 
 
 class Link:
-    """One peer: what it was promised, what is under way to and from it, who speaks there."""
+    """One peer: what it was promised, what is under way to and from it, who speaks there. `ring` is `down` where kernels fill it."""
 
-    def __init__(self, index: int, sitl: config.Sitl, streams: list[Stream]) -> None:
+    def __init__(self, index: int, sitl: config.Sitl, streams: list[Stream], tables: frames.Tables | None = None) -> None:
         self.index = index
         self.system, self.component = sitl.system, sitl.component
-        self.streams = {s.name: s for s in streams}
+        self.offered, self.streams = streams, {s.name: s for s in streams}
         self.ordered: list[Stream] = []  # those that are on, in the order in which they are sent
         self.speakers: set[tuple[int, int]] = set()
-        self.down = Queue(sitl.link, np.random.default_rng([sitl.seed, 1000 + index, 0]))
+        self.ring = None if tables is None else Ring(sitl, tables)
+        self.down = self.ring or Queue(sitl.link, np.random.default_rng([sitl.seed, 1000 + index, 0]))
         self.up = Queue(sitl.link, np.random.default_rng([sitl.seed, 1000 + index, 1]))
         self.sent = self.received = self.refused = 0
         self._seq = 0
 
     def set_interval(self, name: str, interval_us: int, t_us: int) -> None:
         """Turn a stream on (interval > 0) or off (0)."""
-        self.streams[name].every(interval_us, t_us)
+        stream = self.streams[name]
+        stream.every(interval_us, t_us)
+        if self.ring is not None:
+            self.ring.every(stream.rank, interval_us, stream.due_us)
         self.ordered = sorted((s for s in self.streams.values() if s.interval_us), key=lambda s: s.rank)
+
+    @property
+    def due_us(self) -> int:
+        """When the next stream is due."""
+        if self.ring is not None:
+            return int(self.ring.wire["next_us"])
+        return min((stream.due_us for stream in self.ordered), default=NEVER)
 
     def restart(self) -> None:
         """The autopilot has booted again: its sequence starts anew."""
         self._seq = 0
+        if self.ring is not None:
+            self.ring.restart()
 
     def encode(self, message: Message) -> bytes:
         """The next frame of ours on this link."""

@@ -142,7 +142,7 @@ class Run:
         signer: Signer | None = None,
     ) -> None:
         self._writer = tlog.Writer(log) if log else None
-        self.sim = Simulation(sitl, self._writer.write_all if self._writer else None, lockstep, signer)
+        self.sim = Simulation(sitl, self._writer.write_bytes if self._writer else None, lockstep, signer)
         if signer is not None and not lockstep:  # simulation time 0 is now
             signer.offset_us = time.time_ns() // 1000 - self.sim.epoch_us
         self.ports = Ports(self.sim)

@@ -4,14 +4,14 @@ A shell (`sitl.shell`) opens links, hands over what arrives, moves vehicle time 
 is a function of the configuration and of which bytes came at which vehicle time.
 """
 
-import bisect
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from operator import itemgetter
 from typing import Any
 
 from mavquad import wire
 from mavquad.errors import WireError
+from mavquad.link import tlog
 from mavquad.link.signing import SETUP_SIGNING, Signer
 from mavquad.wire import Frame
 from sitl import ardupilot, config, links, px4, telemetry
@@ -20,20 +20,21 @@ from sitl.faults import Faults
 from sitl.helicopter import Helicopter
 from sitl.links import NEVER, Link, Stream
 from sitl.params import Table
+from sitl.ring import Ring
 from sitl.services import Services
 from sitl.vehicle import Vehicle
+from sitl.voice import Voice
 
 COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 _HEARTBEAT, _TIMESYNC = wire.ID["HEARTBEAT"], wire.ID["TIMESYNC"]
-TRUTH_COMPONENT = 25  # MAV_COMP_ID_USER1: truth has a sequence of its own
 _BOOT_SILENCE_US = 1_500_000
 _TEXT = 50  # characters of a STATUSTEXT
-Record = Callable[[list[tuple[int, bytes]]], None]
+Record = Callable[[int, bytes], None]
 
 
 class Simulation:
-    """One vehicle, its autopilot and its links. `record([(t_us, raw), ...])` is given, once a control period, every frame
-    and the truth, stamped in vehicle time (from `config.EPOCH_US` on).
+    """One vehicle, its autopilot and its links. `record(t_us, data)` is given, once a control period, the records of
+    a tlog up to t_us: every frame and the truth, stamped in vehicle time (from `config.EPOCH_US` on).
 
     With `lockstep` time waits (in the shell) for a companion: its first HEARTBEAT, then an answer to each period's barrier.
     """
@@ -53,13 +54,14 @@ class Simulation:
         self.gyro_name = "gyro_rad_s" if sitl.personality == "px4" else "rates_rad_s"
         self.mocap_age_us = 1000 * sitl.noise.mocap_delay_ms
         self._record = record
-        self._records: list[tuple[int, bytes]] = []  # sent, and the truth
+        self._records: list[tuple[int, bytes]] = []  # sent, and the truth: stamp and whole records
         self._heard: list[tuple[int, bytes]] = []
         self._period_us = 1000 * sitl.period_ms
         self._services = Services(self)
         self.faults = Faults(sitl.faults, self)
         self._reboot_us = NEVER
         self._silent_until_us = 0
+        self._voice = Voice(sitl, self.vehicle, self.gyro_name)
         self.autopilot = self._boot()
         self._tick_us = TICK_US
         self._stream_us = NEVER
@@ -67,7 +69,7 @@ class Simulation:
         self._barriers: deque[int] = deque()  # those not answered yet, us of vehicle time
         self._answered = 0  # barriers
         self._first_heartbeat: bytes | None = None
-        self._truth_seq = self._texts = 0
+        self._texts = 0
 
     @property
     def t_us(self) -> int:
@@ -77,9 +79,10 @@ class Simulation:
     # ---- links --------------------------------------------------------------------------------------------------------
     def open_link(self) -> Link:
         """A new peer; its default streams begin at once."""
-        builds = telemetry.builders(self)
-        streams = [Stream(name, rank, builds[name]) for rank, name in enumerate(telemetry.ORDER) if name in self._offered()]
-        link = Link(len(self.links), self.config, streams)
+        builds, offered = telemetry.builders(self), self._offered()
+        streams = [Stream(name, rank, builds[name]) for rank, name in enumerate(offered)]
+        plain = self.signer is None and not self.config.link.jitter_ms and not links.faulty(self.config.link)
+        link = Link(len(self.links), self.config, streams, self._voice.tables(offered) if plain else None)
         self.links.append(link)
         for name in link.streams:
             self.set_interval(link, name, 0)
@@ -92,7 +95,7 @@ class Simulation:
             wanted_us = round(1e6 / hz) if hz else -1
         dt_us = self.vehicle.dt_us
         link.set_interval(name, max(dt_us, -(-wanted_us // dt_us) * dt_us) if wanted_us > 0 else 0, self.t_us)
-        self._stream_us = min(s.due_us for peer in self.links for s in peer.ordered) if link.ordered else self._stream_us
+        self._stream_us = min(peer.due_us for peer in self.links)
 
     def receive(self, link: Link, data: bytes) -> bool:
         """Bytes of one datagram, sent at the oldest barrier that has no answer yet. True when its answer was in it; before time 0
@@ -123,9 +126,16 @@ class Simulation:
         """Datagrams for this peer: what has come through its wire by t_us (by now; later by its delay at most), and the barrier
         for the lockstep's partner."""
         t_us = self.t_us if t_us is None else t_us
+        barrier_ns = 1000 * t_us if link is self.partner and self._barriers and self._barriers[-1] == t_us else -1
+        if isinstance(link.down, Ring):
+            ours, datagrams, records = link.down.leave(t_us, self.epoch_us + t_us, barrier_ns)
+            link.sent += ours
+            if records and self._record is not None:
+                self._records.append((self.epoch_us + t_us, records))
+            return datagrams
         frames = link.down.take(t_us, lambda item: self._frame(link, item, t_us))
-        if link is self.partner and self._barriers and self._barriers[-1] == t_us:
-            frames.append(self._frame(link, ("TIMESYNC", (0, 1000 * t_us)), t_us))
+        if barrier_ns >= 0:
+            frames.append(self._frame(link, ("TIMESYNC", (0, barrier_ns)), t_us))
         return links.datagrams(frames)
 
     def send(self, link: Link, name: str, fields: tuple[Any, ...]) -> None:
@@ -166,7 +176,8 @@ class Simulation:
     def record_period(self) -> None:
         """The truth of this instant, and all that waits for the log: nobody waits for it, so it comes behind what is sent."""
         if self._record is not None:
-            self._write_truth()
+            stamp_us = self.epoch_us + self.t_us
+            self._records.append((stamp_us, self._voice.truth(stamp_us, self.misses, self.autopilot.engaged)))
             self.flush()
 
     def flush(self, last: bool = False) -> None:
@@ -174,17 +185,18 @@ class Simulation:
         if self._record is not None and (self._records or self._heard):
             until_us = NEVER if last else self.epoch_us + min([self.t_us + 1, *self._barriers])
             records = sorted(self._records + self._heard, key=itemgetter(0))
-            self._record(records[: bisect.bisect_left(records, until_us, key=itemgetter(0))])
+            ready = [record for stamp_us, record in records if stamp_us < until_us]
+            if ready:
+                self._record(records[len(ready) - 1][0], b"".join(ready))
             self._records = [record for record in self._records if record[0] >= until_us]
             self._heard = [record for record in self._heard if record[0] >= until_us]
 
     def run_until(self, t_us: int) -> None:
         """Move on to t_us (a whole number of loop periods): plant, arrivals, modes and streams at their instants."""
-        vehicle, links_, dt_us = self.vehicle, self.links, self.vehicle.dt_us
+        vehicle, links_ = self.vehicle, self.links
         now_us = vehicle.t_us
         while now_us < t_us:
-            due_us = min(t_us, self._stream_us, self._tick_us, self.faults.due_us, *[link.up.due_us + 1 for link in links_])
-            vehicle.run(max(1, -(-(due_us - now_us) // dt_us)))
+            self._move(now_us, t_us)
             now_us = vehicle.t_us
             if now_us >= self.faults.due_us:
                 self.faults.apply(now_us)
@@ -201,6 +213,10 @@ class Simulation:
                 self._ask_time(now_us)
             if now_us >= self._stream_us:
                 self._emit(now_us)
+
+    def truth(self) -> Any:
+        """The truth of this instant as a record (`told.TOLD`); the disturbance is the mean since the last call."""
+        return self._voice.find_truth(self.misses, self.autopilot.engaged)
 
     def battery(self) -> float:
         """What is left of the battery, 1 to 0."""
@@ -228,14 +244,18 @@ class Simulation:
     def _boot(self) -> Autopilot:
         tuned, _ = config.vehicles(self.config)
         if self.config.personality == "px4":
-            return px4.Px4(self.vehicle, Table(px4.defaults(tuned), self.config.params, bytewise=True), self.say)
-        table = Table(ardupilot.defaults(tuned), self.config.params, bytewise=False)
-        return ardupilot.ArduPilot(self.vehicle, table, self.say)
+            table = Table(px4.defaults(tuned), self.config.params, bytewise=True)
+            autopilot: Autopilot = px4.Px4(self.vehicle, table, self.say)
+        else:
+            table = Table(ardupilot.defaults(tuned), self.config.params, bytewise=False)
+            autopilot = ardupilot.ArduPilot(self.vehicle, table, self.say)
+        self._voice.booted(autopilot)
+        return autopilot
 
-    def _offered(self) -> set[str]:
+    def _offered(self) -> list[str]:
         other = {"px4": "EKF_STATUS_REPORT", "ardupilot": "ESTIMATOR_STATUS"}[self.config.personality]
-        without = set() if isinstance(self.vehicle, Helicopter) else {"ACTUATOR_CONTROL_TARGET"}
-        return set(telemetry.ORDER) - {other} - without
+        without = "" if isinstance(self.vehicle, Helicopter) else "ACTUATOR_CONTROL_TARGET"
+        return [name for name in telemetry.ORDER if name not in (other, without)]
 
     def _default_hz(self, name: str) -> float:
         source = self.config.attitude_source
@@ -245,21 +265,51 @@ class Simulation:
             return 0.0
         return {"px4": px4, "ardupilot": ardupilot}[self.config.personality].STREAMS_HZ.get(name, 0.0)
 
-    def _emit(self, t_us: int) -> None:
+    def _move(self, now_us: int, t_us: int) -> None:
+        """To the next instant at which anything is due, or t_us. Streams alone are left to kernels, where one can make them."""
+        vehicle, dt_us = self.vehicle, self.vehicle.dt_us
+        due_us = min(self._tick_us, self.faults.due_us, *[link.up.due_us + 1 for link in self.links])
+        ring = self.links[0].ring if len(self.links) == 1 and self._reboot_us == NEVER else None
+        if ring is None:
+            vehicle.run(max(1, -(-(min(t_us, self._stream_us, due_us) - now_us) // dt_us)))
+            return
+        steps = max(1, -(-(min(t_us, due_us) - now_us) // dt_us))
+        self._voice.heed(self.autopilot)
+        last = due_us > now_us + steps * dt_us
+        rank, self._stream_us = self._voice.leap(ring, steps, last, self._all_laid_out(now_us))
+        if rank >= 0:
+            self._emit(vehicle.t_us, rank)
+
+    def _all_laid_out(self, t_us: int) -> bool:
+        """Whether kernels may make what has a layout: nobody is silent or sick, and nothing is unknown."""
+        return t_us >= self._silent_until_us and not self.faults.sick and self.autopilot.has_origin
+
+    def _emit(self, t_us: int, rank: int = -1) -> None:
+        """What the streams say at this instant; from a `rank` on, which a kernel has left to us."""
         silent, dropping = t_us < self._silent_until_us, self.faults.dropping
-        next_us = NEVER
         for link in self.links:
-            put = link.down.put
+            for stream in self._due(link, t_us, rank):
+                quiet = silent or (dropping and self.faults.drops(stream.name))
+                fields = None if quiet else stream.build()
+                if fields is not None:
+                    link.down.put(t_us, (stream.name, fields))
+        self._stream_us = min(link.due_us for link in self.links)
+
+    def _due(self, link: Link, t_us: int, rank: int) -> Iterator[Stream]:
+        """The streams of a peer that are due now and that no kernel makes, in the order in which they are sent."""
+        if link.ring is None:
             for stream in link.ordered:
                 if stream.due_us <= t_us:
                     stream.due_us += stream.interval_us
-                    quiet = silent or (dropping and self.faults.drops(stream.name))
-                    fields = None if quiet else stream.build()
-                    if fields is not None:
-                        put(t_us, (stream.name, fields))
-                if stream.due_us < next_us:
-                    next_us = stream.due_us
-        self._stream_us = next_us
+                    yield stream
+            return
+        self._voice.heed(self.autopilot)
+        all_laid_out = self._all_laid_out(t_us)
+        if rank < 0:
+            rank = self._voice.speak(link.ring, 0, all_laid_out)
+        while rank >= 0:
+            yield link.offered[rank]
+            rank = self._voice.speak(link.ring, rank + 1, all_laid_out)
 
     def _frame(self, link: Link, item: Any, t_us: int) -> bytes:
         if isinstance(item, bytes):  # another's, forwarded as it came
@@ -273,7 +323,7 @@ class Simulation:
 
     def _log(self, raw: bytes, t_us: int) -> None:
         if self._record is not None:
-            self._records.append((self.epoch_us + t_us, raw))
+            self._records.append((self.epoch_us + t_us, _stamped(self.epoch_us + t_us, raw)))
 
     @property
     def _said_us(self) -> int:
@@ -284,7 +334,7 @@ class Simulation:
         """Keep a frame for the log; when it was said."""
         t_us = self._said_us
         if self._record is not None:
-            self._heard.append((self.epoch_us + t_us, raw))
+            self._heard.append((self.epoch_us + t_us, _stamped(self.epoch_us + t_us, raw)))
         return t_us
 
     def _answers(self, frame: Frame) -> bool:
@@ -369,12 +419,10 @@ class Simulation:
             for link in self.links:
                 self.send(link, "TIMESYNC", (0, 1000 * (t_us - self.autopilot.boot_us)))
 
-    def _write_truth(self) -> None:
-        for name, fields in zip(("ODOMETRY", "DEBUG_FLOAT_ARRAY"), telemetry.truth(self), strict=True):
-            raw = wire.encode(name, fields, seq=self._truth_seq, system=self.config.system, component=TRUTH_COMPONENT)
-            self._truth_seq = (self._truth_seq + 1) & 0xFF
-            self._log(raw, self.t_us)
-
 
 def _as_it_is(item: Any) -> Any:
     return item
+
+
+def _stamped(t_us: int, raw: bytes) -> bytes:
+    return t_us.to_bytes(tlog.STAMP, "big") + raw

@@ -7,6 +7,8 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from mavquad import wire
+from sitl import frames
 from sitl.autopilot import geodetic
 from sitl.config import ORIGIN
 from sitl.helicopter import Helicopter
@@ -61,6 +63,55 @@ SENSOR_OF = {  # whose dropout silences a message
     "ATTITUDE_QUATERNION": ("attitude",),
 }
 
+GYRO = "gyro"  # whichever gyro the personality sends
+_COVARIANCE = (NAN,) + (0.0,) * 20
+# Messages that are fields of the vehicle's record (`state.VEHICLE`) and of `told.TOLD`, and constants: kernels make them (`frames`).
+# What a faulty sensor would change has its name before it.
+LAYOUTS: dict[str, frames.Layout] = {
+    "HIGHRES_IMU": ("clock_us", "accel:accel_m_s2", "gyro:gyro", "magnetometer_gauss", "barometer", 25.0, 0x1FFF, 0),
+    "ATT_POS_MOCAP": ("mocap_us", "mocap:mocap_q_wxyz", "mocap:mocap_p_ned_m", _COVARIANCE),
+    "LOCAL_POSITION_NED": ("clock_ms", "position:nav_p_ned_m", "position:nav_v_ned_m_s"),
+    "SERVO_OUTPUT_RAW": ("clock_us", 0, "pwm_us", _ZEROS_12),
+    "ATTITUDE_TARGET": ("clock_ms", "type_mask", "echo_q_wxyz", "echo_rates_rad_s", "thrust"),
+    "ATTITUDE": ("clock_ms", "attitude:ahrs_euler_rad", "attitude:rates_rad_s"),
+    "ATTITUDE_QUATERNION": ("clock_ms", "attitude:ahrs_q_wxyz", "attitude:rates_rad_s", (0.0,) * 4),
+}
+TRUTH: dict[str, frames.Layout] = {
+    "ODOMETRY": (
+        *("t_us", 1, 12, "p_ned_m", "true_q_wxyz", "v_frd_m_s", "omega_rad_s"),
+        *(_COVARIANCE, _COVARIANCE, 0, 0, 100),
+    ),
+    "DEBUG_FLOAT_ARRAY": (
+        *("t_us", b"truth", 1, "force_m_s2", "torque_rad_s2", "wind_ned_m_s", "thrust_m_s2", "misses", "engaged"),
+        (0.0,) * 46,
+    ),
+}
+
+
+def without_sensors(layout: frames.Layout) -> frames.Layout:
+    """A layout with nothing before the names of fields."""
+    return [entry.rpartition(":")[2] if isinstance(entry, str) else entry for entry in layout]
+
+
+def laid_out(sim: "Simulation", name: str) -> Callable[[], Fields]:
+    """The fields of a message of `LAYOUTS` read one by one, as faults of the sensors let them."""
+    v, msgid, read = sim.vehicle, wire.ID[name], sim.faults.read
+    clocks: dict[str, Callable[[], int]] = {
+        "clock_us": lambda: v.t_us - sim.autopilot.boot_us,
+        "clock_ms": lambda: (v.t_us - sim.autopilot.boot_us) // 1000,
+        "mocap_us": lambda: v.t_us - sim.autopilot.boot_us - sim.mocap_age_us,
+    }
+    parts: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
+    for entry in LAYOUTS[name]:
+        if not isinstance(entry, str):
+            parts.append((tuple, (entry if isinstance(entry, tuple) else (entry,),)))
+        elif entry in clocks:
+            parts.append((lambda clock: (clock(),), (clocks[entry],)))
+        else:
+            sensor, _, view = entry.rpartition(":")
+            parts.append((read, (sensor, sim.gyro_name if view == GYRO else view)))
+    return lambda: frames.fields(msgid, [item for part, given in parts for item in part(*given)])
+
 
 def builders(sim: "Simulation") -> dict[str, Callable[[], Fields | None]]:
     """Every message that this autopilot can stream: name -> a function that gives its fields, or None for nothing to say."""
@@ -72,29 +123,21 @@ def builders(sim: "Simulation") -> dict[str, Callable[[], Fields | None]]:
     def boot_ms() -> int:
         return boot_us() // 1000
 
-    def highres_imu() -> Fields:
-        state = v.state.view
-        air = (*state["magnetometer_gauss"].tolist(), *state["barometer"].tolist())
-        return v.t_us - sim.autopilot.boot_us, *read("accel", "accel_m_s2"), *read("gyro", sim.gyro_name), *air, 25.0, 0x1FFF, 0
-
     def coarse_imu() -> tuple[int, ...]:
         a = [_int16(1000.0 / GRAVITY_M_S2 * x) for x in read("accel", "accel_m_s2")]
         g = [_int16(1000.0 * x) for x in read("gyro", sim.gyro_name)]
         m = [_int16(1000.0 * x) for x in v.state.view["magnetometer_gauss"].tolist()]
         return (*a, *g, *m)
 
-    def servo_output_raw() -> Fields:
-        return boot_us() & 0xFFFFFFFF, 0, *v.state.view["pwm_us"].tolist(), *_ZEROS_12
-
     def actuator_control_target() -> Fields | None:
         if not isinstance(v, Helicopter):
             return None
         return boot_us(), 0, (*v.sticks(), 0.0, 0.0, 0.0, 0.0)
 
+    position = laid_out(sim, "LOCAL_POSITION_NED")
+
     def local_position_ned() -> Fields | None:
-        if not sim.autopilot.has_origin:
-            return None
-        return boot_ms(), *read("position", "nav_p_ned_m"), *read("position", "nav_v_ned_m_s")
+        return position() if sim.autopilot.has_origin else None
 
     def global_position_int() -> Fields | None:
         if not sim.autopilot.has_origin:
@@ -160,18 +203,11 @@ def builders(sim: "Simulation") -> dict[str, Callable[[], Fields | None]]:
         return speed, speed, heading, round(100.0 * v.state["thrust"]), ORIGIN[2] - p[2], -u[2]
 
     return {
+        **{name: laid_out(sim, name) for name in LAYOUTS},
         "HEARTBEAT": lambda: sim.autopilot.heartbeat(),
-        "HIGHRES_IMU": highres_imu,
         "RAW_IMU": lambda: (boot_us(), *coarse_imu(), 0, 2500),
         "SCALED_IMU": lambda: (boot_ms(), *coarse_imu(), 2500),
-        "ATT_POS_MOCAP": lambda: (
-            v.t_us - sim.autopilot.boot_us - sim.mocap_age_us,
-            read("mocap", "mocap_q_wxyz"),
-            *read("mocap", "mocap_p_ned_m"),
-            (NAN,) + (0.0,) * 20,
-        ),
         "LOCAL_POSITION_NED": local_position_ned,
-        "SERVO_OUTPUT_RAW": servo_output_raw,
         "ACTUATOR_CONTROL_TARGET": actuator_control_target,
         "ATTITUDE_TARGET": attitude_target,
         "POSITION_TARGET_LOCAL_NED": position_target,
@@ -186,59 +222,13 @@ def builders(sim: "Simulation") -> dict[str, Callable[[], Fields | None]]:
         "VFR_HUD": vfr_hud,
         "BATTERY_STATUS": battery_status,
         "SIM_STATE": sim_state,
-        "ATTITUDE": lambda: (boot_ms(), *read("attitude", "ahrs_euler_rad"), *read("attitude", "rates_rad_s")),
-        "ATTITUDE_QUATERNION": lambda: (
-            boot_ms(),
-            *read("attitude", "ahrs_q_wxyz"),
-            *read("attitude", "rates_rad_s"),
-            (0.0,) * 4,
-        ),
     }
-
-
-def truth(sim: "Simulation") -> tuple[Fields, Fields]:
-    """(ODOMETRY, DEBUG_FLOAT_ARRAY `truth`) of this instant; the disturbance is the mean since the last call."""
-    s = sim.vehicle.state
-    t_us, view = sim.vehicle.t_us, s.view
-    R = view["R"].tolist()
-    summed = max(1, s["summed"])
-    force = [x / summed for x in view["disturbance_m_s2"].tolist()]
-    torque = [x / summed for x in view["disturbance_rad_s2"].tolist()]
-    s["disturbance_m_s2"], s["disturbance_rad_s2"], s["summed"] = 0.0, 0.0, 0
-    thrust = sum(view["thrust_n"].tolist()) / sim.vehicle.constants["mass_kg"]
-    velocity = _body(R, view["v_ned_m_s"].tolist())
-    covariance = (NAN,) + (0.0,) * 20
-    odometry = (
-        t_us,
-        1,
-        12,
-        *view["p_ned_m"].tolist(),
-        sim.vehicle.quaternion(),
-        *velocity,
-        *view["omega_rad_s"].tolist(),
-        covariance,
-        covariance,
-        0,
-        0,
-        100,
-    )
-    data = (*force, *torque, *view["wind_ned_m_s"].tolist(), thrust, float(sim.misses), float(sim.autopilot.engaged))
-    return odometry, (t_us, "truth", 1, data + (0.0,) * (58 - len(data)))
 
 
 def autopilot_version(kind: int, capabilities: int, version: int) -> Fields:
     """AUTOPILOT_VERSION."""
     empty = (0,) * 8
     return capabilities, version, 0, 0, 0, empty, empty, empty, 0, 0, 0x6D61767175616400 + kind, (0,) * 18
-
-
-def _body(R: list[float], v: Any) -> tuple[float, float, float]:
-    """R^T v in plain Python."""
-    return (
-        R[0] * v[0] + R[3] * v[1] + R[6] * v[2],
-        R[1] * v[0] + R[4] * v[1] + R[7] * v[2],
-        R[2] * v[0] + R[5] * v[1] + R[8] * v[2],
-    )
 
 
 def _int16(x: float) -> int:

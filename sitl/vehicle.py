@@ -1,7 +1,7 @@
 """The vehicle with its sensors and inner loops: one compiled call from one sampling instant to the next."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -99,16 +99,29 @@ class Vehicle:
     def run(self, steps: int) -> None:
         """Move on by a number of loop periods."""
         while steps > 0:
-            now = min(steps, self._left)
+            now = self.at_once(steps)
             self.actuate(now)
-            self.t_us += now * self.dt_us
-            self._left -= now
+            self.passed(now)
             steps -= now
-            if not self._left:
-                self._draw()
+
+    def at_once(self, steps: int) -> int:
+        """How many of these steps the normals drawn last for."""
+        return min(steps, self._left)
+
+    def passed(self, steps: int) -> None:
+        """That many steps were made, at most `at_once`."""
+        self.t_us += steps * self.dt_us
+        self._left -= steps
+        if not self._left:
+            self._draw()
+
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        """What its kernel `advance` works on."""
+        return self.state.array, self.setpoint.array, self.constants.array, self._gusts, self._normals
 
     def actuate(self, steps: int) -> None:
-        """That many steps, which the normals drawn last for."""
+        """That many steps, at most `at_once`."""
         advance(self.state.array, self.setpoint.array, self.constants.array, self._gusts, self._normals, steps)
 
     def _noise(self, seed: int) -> tuple[list[np.random.Generator], np.ndarray]:

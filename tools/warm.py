@@ -59,7 +59,7 @@ def steps() -> Iterator[Step]:
     from mavquad.plan import COMPENSATORS, CONTROLLERS, OBSERVERS
 
     yield "reading logs", _logs
-    yield "the simulated vehicle", vehicle
+    yield "the simulated vehicles", vehicle
     for name in OBSERVERS:
         yield f"observer {name}", lambda name=name: _stages(observers=[name])  # type: ignore[misc]
     for name in CONTROLLERS:
@@ -90,11 +90,18 @@ def flight(resolved: "Resolved") -> None:
 
 
 def vehicle() -> None:
-    """A second of the simulated vehicle, alone."""
+    """A second of each simulated vehicle: alone, then with a peer and a log."""
     from sitl.config import Sitl
     from sitl.simulation import Simulation
 
-    Simulation(Sitl()).run_until(1_000_000)
+    for airframe in ("x500", "helicopter"):
+        sim = Simulation(Sitl(airframe=airframe), lambda t_us, records: None)
+        sim.run_period()
+        link = sim.open_link()
+        while sim.t_us < 1_100_000:
+            sim.run_period()
+            sim.collect(link)
+            sim.record_period()
 
 
 def records() -> None:

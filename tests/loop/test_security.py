@@ -255,8 +255,7 @@ def deliver(client, raw):
 
 
 def test_the_simulated_autopilot_signs_and_takes_only_what_is_signed():
-    client = Client()
-    client.sim.signer = Signer(KEY, Memory())
+    client = Client(signer=Signer(KEY, Memory()))
     heard = []
     original = client.sim.collect
 

@@ -175,11 +175,11 @@ def test_sequence_numbers_count_every_frame_of_a_link():
 
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_others():
     def flight(seed):
-        frames = []
-        c = Client(f"seed={seed}", "wind.mean_m_s=4", "wind.w20_m_s=8", record=frames.extend)
+        log = []
+        c = Client(f"seed={seed}", "wind.mean_m_s=4", "wind.w20_m_s=8", record=lambda t_us, data: log.append(data))
         c.take_off(2.0)
         c.run(1.2, c.attitude)
-        return frames
+        return b"".join(log)
 
     first = flight(3)
     assert first == flight(3)

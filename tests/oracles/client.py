@@ -12,8 +12,8 @@ HOVER = 0.5735  # collective of the x500
 class Client:
     """Every message of the autopilot is kept by name; texts and results of commands apart."""
 
-    def __init__(self, *changes, record=None):
-        self.sim = simulation.Simulation(config.load(None, list(changes)), record)
+    def __init__(self, *changes, record=None, signer=None):
+        self.sim = simulation.Simulation(config.load(None, list(changes)), record, signer=signer)
         self.link = self.sim.open_link()
         self.counts, self.last, self.texts, self.acks = Counter(), {}, [], {}
         self.history = []

@@ -11,7 +11,7 @@ import numpy as np
 from mavquad import control_step, lifecycle, pipeline, wire
 from mavquad.errors import ConfigError
 from mavquad.lifecycle import ENGAGED, OBSERVING
-from sitl import ardupilot, config, px4, telemetry
+from sitl import ardupilot, config, px4
 from sitl.autopilot import TICK_US, Home
 from sitl.simulation import Simulation
 from tools.bulk.setup import HOVER_US, end_us, lift_off, plan_of, why_not
@@ -109,8 +109,10 @@ class Loop:
         state = self.sim.vehicle.state
         while self.sim.t_us < (until_us or self.end_us) and not state["grounded"]:
             self.period()
-            odometry, (t_us, _, _, data) = telemetry.truth(self.sim)
-            self._truth.append((t_us, *odometry[3:6], *odometry[6], *odometry[10:13], *data[: len(TRUTH)]))
+            told = self.sim.truth()
+            moved = (*state["p_ned_m"], *told["true_q_wxyz"], *state["omega_rad_s"])
+            felt = (*told["force_m_s2"], *told["torque_rad_s2"], *state["wind_ned_m_s"], told["thrust_m_s2"])
+            self._truth.append((self.sim.t_us, *moved, *felt, told["misses"], told["engaged"]))
         return self._flown()
 
     def note(self) -> list[float]:

@@ -1,0 +1,101 @@
+"""The compiled half of what the autopilot says: its records, and the calls of the kernels that read them."""
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sitl import frames, leap, telemetry, told
+from sitl.autopilot import Autopilot
+from sitl.helicopter import Helicopter
+from sitl.ring import Ring
+from sitl.state import Record
+from sitl.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    from sitl import config
+
+_COMPONENT = 25  # MAV_COMP_ID_USER1: truth has a sequence of its own
+_LOG = 1024  # bytes: room for the two records of the truth
+
+
+class Voice:
+    """The records of one vehicle's autopilot; each `Ring` is a peer that hears it."""
+
+    def __init__(self, sitl: "config.Sitl", vehicle: Vehicle, gyro: str) -> None:
+        self.told = Record(told.TOLD, mocap_age_us=1000 * sitl.noise.mocap_delay_ms)
+        self._words = {**told.WORDS, telemetry.GYRO: told.WORDS[gyro]}
+        self._vehicle = vehicle
+        self._leap: Any = leap.rotorcraft if isinstance(vehicle, Helicopter) else leap.multirotor
+        self._blocks = vehicle.state.array.view(np.float64), self.told.array.view(np.float64)
+        self._truth = frames.tables(telemetry.TRUTH, self._words)
+        self._system, self._said = sitl.system, 0
+        self._log = np.zeros(_LOG, np.uint8)
+        self._echo: tuple[float, ...] | None = None
+
+    def tables(self, streams: Iterable[str]) -> frames.Tables:
+        """Of the streams of a peer, in their order."""
+        plain = {
+            name: telemetry.without_sensors(telemetry.LAYOUTS[name]) if name in telemetry.LAYOUTS else None for name in streams
+        }
+        return frames.tables(plain, self._words)
+
+    def heed(self, autopilot: Autopilot) -> None:
+        """What the kernels have to know of the autopilot before they speak."""
+        if autopilot.echo_q is not self._echo and not autopilot.shapes:
+            self._echo = autopilot.echo_q
+            self.told["echo"] = told.TARGET if self._echo is None else told.GIVEN
+            if self._echo is not None:
+                self.told["echo_q_wxyz"] = self._echo
+
+    def booted(self, autopilot: Autopilot) -> None:
+        """Its clock is that of this autopilot."""
+        self._echo = None
+        self.told["booted_us"], self.told["echo"] = autopilot.boot_us, told.SHAPED if autopilot.shapes else told.TARGET
+
+    def leap(self, ring: Ring, steps: int, last: bool, all_laid_out: bool) -> tuple[int, int]:
+        """Move on by at most `steps` and speak on the way, at the last of them where `last` says so: (`leap.DONE`, FULL, or the
+        number of a stream that Python has to make at this instant; when the next stream is due)."""
+        vehicle = self._vehicle
+        span = vehicle.t_us, vehicle.at_once(steps), vehicle.dt_us, last, all_laid_out
+        made, rank, next_us = self._leap(*vehicle.arrays, self.told.array, *ring.arrays, *self._blocks, span)
+        vehicle.passed(made)
+        return rank, next_us
+
+    def speak(self, ring: Ring, rank: int, all_laid_out: bool) -> int:
+        """Queue what is due now from stream `rank` on; what it returns is as of `leap`."""
+        v = self._vehicle
+        while True:
+            found: int = leap.speak(
+                v.state.array, v.setpoint.array, self.told.array, *ring.arrays, *self._blocks, v.t_us, rank, all_laid_out
+            )
+            if found != leap.FULL:
+                return found
+            ring.room(len(ring.slots))
+
+    def truth(self, stamp_us: int, misses: int, engaged: bool) -> bytes:
+        """The log's records of this instant's truth."""
+        v, messages, moves = self._vehicle, *self._truth
+        sender = self._said, self._system, _COMPONENT
+        self._said = (self._said + len(messages)) & 0xFF
+        end = told.write_truth(
+            v.state.array,
+            v.constants.array,
+            self.told.array,
+            v.t_us,
+            float(misses),
+            float(engaged),
+            messages,
+            moves,
+            *self._blocks,
+            sender,
+            stamp_us,
+            self._log,
+        )
+        return self._log[:end].tobytes()
+
+    def find_truth(self, misses: int, engaged: bool) -> Record:
+        """The truth of this instant, in a record."""
+        v = self._vehicle
+        told.find_truth(v.state.array, v.constants.array, self.told.array, v.t_us, float(misses), float(engaged))
+        return self.told
