@@ -47,6 +47,11 @@ class Faults:
         self.due_us = self._events[0][0] if self._events else NEVER
 
     @property
+    def none(self) -> bool:
+        """All sensors are well."""
+        return not self._active
+
+    @property
     def sick(self) -> set[str]:
         """Sensors that are not well: for the health bits."""
         return set(self._active)

@@ -18,12 +18,16 @@ def speak(machine, setpoint, voice, wire, streams, moves, slots, words, more, t_
 
 @kernel
 def multirotor(machine, setpoint, constants, gusts, normals, voice, wire, streams, moves, slots, words, more, span):
-    """span: (t_us, steps, dt_us, whether to speak at the last of them, all_laid_out). Returns (steps made, as `speak`, next_us)."""
+    """`speak` now and after each step; after the last where `last` says so. span: (t_us, steps, dt_us, last, all_laid_out).
+
+    Returns (steps made, as `speak`, when the next stream is due): all steps, unless something is left to Python.
+    """
     t_us, steps, dt_us, last, all_laid_out = span
     w = wire[0]
-    for k in range(1, steps + 1):
-        vehicle.advance(machine, setpoint, constants, gusts, normals, 1)
-        t_us += dt_us
+    for k in range(steps + 1):
+        if k > 0:
+            vehicle.advance(machine, setpoint, constants, gusts, normals, 1)
+            t_us += dt_us
         if t_us >= w.next_us and (k < steps or last):
             rank = speak(machine, setpoint, voice, wire, streams, moves, slots, words, more, t_us, 0, all_laid_out)
             if rank != DONE:
@@ -36,9 +40,10 @@ def rotorcraft(machine, setpoint, constants, heli, gusts, normals, voice, wire, 
     """`multirotor` for the helicopter."""
     t_us, steps, dt_us, last, all_laid_out = span
     w = wire[0]
-    for k in range(1, steps + 1):
-        helicopter.advance(machine, setpoint, constants, heli, gusts, normals, 1)
-        t_us += dt_us
+    for k in range(steps + 1):
+        if k > 0:
+            helicopter.advance(machine, setpoint, constants, heli, gusts, normals, 1)
+            t_us += dt_us
         if t_us >= w.next_us and (k < steps or last):
             rank = speak(machine, setpoint, voice, wire, streams, moves, slots, words, more, t_us, 0, all_laid_out)
             if rank != DONE:

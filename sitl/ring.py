@@ -35,11 +35,6 @@ class Ring:
             spec = wire.spec(item[0])
             self._enter(t_us, spec.msgid, spec.crc_extra, spec.pack(item[1]))
 
-    @property
-    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """What kernels that speak work on."""
-        return self.wire.array, self.streams, self.moves, self.slots
-
     def every(self, rank: int, interval_us: int, due_us: int) -> None:
         """A stream's interval and when it is due first (NEVER: it is off)."""
         self.streams[rank]["interval_us"], self.streams[rank]["due_us"] = interval_us, due_us
@@ -79,6 +74,7 @@ class Ring:
         self._out = np.zeros((size + 1) * BODY, np.uint8)
         self._log = np.zeros((size + 1) * (BODY + STAMP), np.uint8)
         self._cuts = np.zeros(size + 1, np.int64)
+        self.arrays = self.wire.array, self.streams, self.moves, self.slots  # what kernels that speak work on
 
     def _enter(self, t_us: int, msgid: int, extra: int, data: bytes) -> None:
         body = np.frombuffer(data, np.uint8)

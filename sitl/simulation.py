@@ -5,19 +5,18 @@ is a function of the configuration and of which bytes came at which vehicle time
 """
 
 from collections import deque
-from collections.abc import Callable, Iterator
-from operator import itemgetter
+from collections.abc import Iterator
 from typing import Any
 
 from mavquad import wire
 from mavquad.errors import WireError
-from mavquad.link import tlog
 from mavquad.link.signing import SETUP_SIGNING, Signer
 from mavquad.wire import Frame
 from sitl import ardupilot, config, links, px4, telemetry
 from sitl.autopilot import TICK_US, Autopilot, check_airframe
 from sitl.faults import Faults
 from sitl.helicopter import Helicopter
+from sitl.journal import Journal, Record, stamped
 from sitl.links import NEVER, Link, Stream
 from sitl.params import Table
 from sitl.ring import Ring
@@ -29,7 +28,6 @@ COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 _HEARTBEAT, _TIMESYNC = wire.ID["HEARTBEAT"], wire.ID["TIMESYNC"]
 _BOOT_SILENCE_US = 1_500_000
 _TEXT = 50  # characters of a STATUSTEXT
-Record = Callable[[int, bytes], None]
 
 
 class Simulation:
@@ -53,9 +51,7 @@ class Simulation:
         # ArduPilot sends its gyro behind its low-pass
         self.gyro_name = "gyro_rad_s" if sitl.personality == "px4" else "rates_rad_s"
         self.mocap_age_us = 1000 * sitl.noise.mocap_delay_ms
-        self._record = record
-        self._records: list[tuple[int, bytes]] = []  # sent, and the truth: stamp and whole records
-        self._heard: list[tuple[int, bytes]] = []
+        self._journal = Journal(record)
         self._period_us = 1000 * sitl.period_ms
         self._services = Services(self)
         self.faults = Faults(sitl.faults, self)
@@ -130,8 +126,8 @@ class Simulation:
         if isinstance(link.down, Ring):
             ours, datagrams, records = link.down.leave(t_us, self.epoch_us + t_us, barrier_ns)
             link.sent += ours
-            if records and self._record is not None:
-                self._records.append((self.epoch_us + t_us, records))
+            if records:
+                self._journal.sent(self.epoch_us + t_us, records)
             return datagrams
         frames = link.down.take(t_us, lambda item: self._frame(link, item, t_us))
         if barrier_ns >= 0:
@@ -175,31 +171,34 @@ class Simulation:
 
     def record_period(self) -> None:
         """The truth of this instant, and all that waits for the log: nobody waits for it, so it comes behind what is sent."""
-        if self._record is not None:
+        if self._journal.kept:
             stamp_us = self.epoch_us + self.t_us
-            self._records.append((stamp_us, self._voice.truth(stamp_us, self.misses, self.autopilot.engaged)))
+            self._journal.sent(stamp_us, self._voice.truth(stamp_us, self.misses, self.autopilot.engaged))
             self.flush()
 
     def flush(self, last: bool = False) -> None:
         """Hand over what is not recorded yet, by stamp; what truth or answers may still come before waits for them."""
-        if self._record is not None and (self._records or self._heard):
-            until_us = NEVER if last else self.epoch_us + min([self.t_us + 1, *self._barriers])
-            records = sorted(self._records + self._heard, key=itemgetter(0))
-            ready = [record for stamp_us, record in records if stamp_us < until_us]
-            if ready:
-                self._record(records[len(ready) - 1][0], b"".join(ready))
-            self._records = [record for record in self._records if record[0] >= until_us]
-            self._heard = [record for record in self._heard if record[0] >= until_us]
+        now_us = self.vehicle.t_us
+        until_us = min(now_us + 1, self._barriers[0]) if self._barriers else now_us + 1
+        self._journal.flush(NEVER if last else self.epoch_us + until_us)
 
     def run_until(self, t_us: int) -> None:
         """Move on to t_us (a whole number of loop periods): plant, arrivals, modes and streams at their instants."""
-        vehicle, links_ = self.vehicle, self.links
+        vehicle, links_, faults = self.vehicle, self.links, self.faults
         now_us = vehicle.t_us
         while now_us < t_us:
-            self._move(now_us, t_us)
+            due_us = min(self._tick_us, faults.due_us)
+            for link in links_:
+                if link.up.due_us < due_us:
+                    due_us = link.up.due_us + 1
+            ring = links_[0].ring if len(links_) == 1 and self._reboot_us == NEVER else None
+            if ring is None:
+                self._run(min(t_us, due_us, self._stream_us))
+            else:
+                self._leap(ring, t_us, due_us)
             now_us = vehicle.t_us
-            if now_us >= self.faults.due_us:
-                self.faults.apply(now_us)
+            if now_us >= faults.due_us:
+                faults.apply(now_us)
             if now_us >= self._reboot_us:
                 self.reboot()
             for link in links_:
@@ -211,8 +210,8 @@ class Simulation:
                 self._services.tick()
                 self.autopilot.tick(now_us)
                 self._ask_time(now_us)
-            if now_us >= self._stream_us:
-                self._emit(now_us)
+            if now_us >= self._stream_us and (now_us >= t_us or ring is None or self._reboot_us != NEVER):
+                self._emit(now_us)  # else the next leap begins with it
 
     def truth(self) -> Any:
         """The truth of this instant as a record (`told.TOLD`); the disturbance is the mean since the last call."""
@@ -265,24 +264,25 @@ class Simulation:
             return 0.0
         return {"px4": px4, "ardupilot": ardupilot}[self.config.personality].STREAMS_HZ.get(name, 0.0)
 
-    def _move(self, now_us: int, t_us: int) -> None:
-        """To the next instant at which anything is due, or t_us. Streams alone are left to kernels, where one can make them."""
+    def _run(self, t_us: int) -> None:
+        """Move the vehicle to t_us, or to the loop's instant behind it."""
+        vehicle = self.vehicle
+        vehicle.run(max(1, -((vehicle.t_us - t_us) // vehicle.dt_us)))
+
+    def _leap(self, ring: Ring, t_us: int, due_us: int) -> None:
+        """Move to t_us or, where anything but streams is due before, to that; what streams say on the way a kernel makes."""
         vehicle, dt_us = self.vehicle, self.vehicle.dt_us
-        due_us = min(self._tick_us, self.faults.due_us, *[link.up.due_us + 1 for link in self.links])
-        ring = self.links[0].ring if len(self.links) == 1 and self._reboot_us == NEVER else None
-        if ring is None:
-            vehicle.run(max(1, -(-(min(t_us, self._stream_us, due_us) - now_us) // dt_us)))
-            return
-        steps = max(1, -(-(min(t_us, due_us) - now_us) // dt_us))
-        self._voice.heed(self.autopilot)
+        now_us = vehicle.t_us
+        steps = max(1, -((now_us - min(t_us, due_us)) // dt_us))
         last = due_us > now_us + steps * dt_us
+        self._voice.heed(self.autopilot)
         rank, self._stream_us = self._voice.leap(ring, steps, last, self._all_laid_out(now_us))
         if rank >= 0:
             self._emit(vehicle.t_us, rank)
 
     def _all_laid_out(self, t_us: int) -> bool:
         """Whether kernels may make what has a layout: nobody is silent or sick, and nothing is unknown."""
-        return t_us >= self._silent_until_us and not self.faults.sick and self.autopilot.has_origin
+        return t_us >= self._silent_until_us and self.faults.none and self.autopilot.has_origin
 
     def _emit(self, t_us: int, rank: int = -1) -> None:
         """What the streams say at this instant; from a `rank` on, which a kernel has left to us."""
@@ -318,12 +318,8 @@ class Simulation:
             raw = link.encode(item)
         else:
             raw = self.signer.sign(link.encode(item), self.epoch_us + t_us, link.index & 0xFF)
-        self._log(raw, t_us)
+        self._journal.sent(self.epoch_us + t_us, stamped(self.epoch_us + t_us, raw))
         return raw
-
-    def _log(self, raw: bytes, t_us: int) -> None:
-        if self._record is not None:
-            self._records.append((self.epoch_us + t_us, _stamped(self.epoch_us + t_us, raw)))
 
     @property
     def _said_us(self) -> int:
@@ -333,8 +329,7 @@ class Simulation:
     def _hear(self, raw: bytes) -> int:
         """Keep a frame for the log; when it was said."""
         t_us = self._said_us
-        if self._record is not None:
-            self._heard.append((self.epoch_us + t_us, _stamped(self.epoch_us + t_us, raw)))
+        self._journal.heard(self.epoch_us + t_us, raw)
         return t_us
 
     def _answers(self, frame: Frame) -> bool:
@@ -422,7 +417,3 @@ class Simulation:
 
 def _as_it_is(item: Any) -> Any:
     return item
-
-
-def _stamped(t_us: int, raw: bytes) -> bytes:
-    return t_us.to_bytes(tlog.STAMP, "big") + raw

@@ -32,6 +32,8 @@ class Voice:
         self._system, self._said = sitl.system, 0
         self._log = np.zeros(_LOG, np.uint8)
         self._echo: tuple[float, ...] | None = None
+        self._heard: object = None  # the arrays in `_arguments`
+        self._arguments: tuple[np.ndarray, ...] = ()
 
     def tables(self, streams: Iterable[str]) -> frames.Tables:
         """Of the streams of a peer, in their order."""
@@ -54,12 +56,21 @@ class Voice:
         self.told["booted_us"], self.told["echo"] = autopilot.boot_us, told.SHAPED if autopilot.shapes else told.TARGET
 
     def leap(self, ring: Ring, steps: int, last: bool, all_laid_out: bool) -> tuple[int, int]:
-        """Move on by at most `steps` and speak on the way, at the last of them where `last` says so: (`leap.DONE`, FULL, or the
-        number of a stream that Python has to make at this instant; when the next stream is due)."""
+        """Speak now, move on by at most `steps` and speak on the way, at the last of them where `last` says so.
+
+        Returns (`leap.DONE`, FULL: some room was made, go on, or the number of a stream that Python has to make at this instant;
+        when the next stream is due).
+        """
         vehicle = self._vehicle
+        if ring.arrays is not self._heard:
+            self._heard = ring.arrays
+            self._arguments = *vehicle.arrays, self.told.array, *ring.arrays, *self._blocks
         span = vehicle.t_us, vehicle.at_once(steps), vehicle.dt_us, last, all_laid_out
-        made, rank, next_us = self._leap(*vehicle.arrays, self.told.array, *ring.arrays, *self._blocks, span)
-        vehicle.passed(made)
+        made, rank, next_us = self._leap(*self._arguments, span)
+        if made:
+            vehicle.passed(made)
+        if rank == leap.FULL:
+            ring.room(len(ring.slots))
         return rank, next_us
 
     def speak(self, ring: Ring, rank: int, all_laid_out: bool) -> int:
