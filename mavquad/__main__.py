@@ -38,6 +38,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--lockstep", action="store_true", help="vehicle time waits for us (the simulated autopilot must be started so too)"
     )
     parser.add_argument(
+        "--speed",
+        type=float,
+        default=1.0,
+        metavar="F",
+        help="a simulated autopilot runs at F times real time (SIM_SPEEDUP of ArduPilot, --speed of ours): delays and time-outs are in its time",
+    )
+    parser.add_argument(
         "--realtime", action="store_true", help="run ahead of all ordinary processes (SCHED_FIFO of Linux; it must be allowed)"
     )
 
@@ -48,6 +55,10 @@ def run(args: argparse.Namespace) -> int:
     from mavquad.link import clock
     from mavquad.link.endpoint import open_endpoint
 
+    if not 0.01 <= args.speed <= 1000.0:
+        raise ConfigError(f"--speed {args.speed}: expected 0.01 to 1000 times real time")
+    if args.speed != 1.0 and args.lockstep:
+        raise ConfigError("--speed with --lockstep: a vehicle that waits for us has no speed; leave one of them away")
     if args.realtime:
         if args.lockstep:
             raise ConfigError("--realtime with --lockstep: a vehicle that waits for us needs no haste; leave one of them away")
@@ -77,6 +88,7 @@ def run(args: argparse.Namespace) -> int:
         engage=args.engage,
         relays=tuple(Relay(*link) for link in further),
         signer=signer,
+        speed=args.speed,
     )
     try:
         plan_file.write(plan_file.beside(companion.log.path), plan.settings, plan.airframe)

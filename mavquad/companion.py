@@ -49,7 +49,10 @@ def request(number: int, plan: Plan, seq: int) -> Frame:
 
 
 class Companion:
-    """One companion on the autopilot's endpoint, with further links (`relay`) beside it."""
+    """One companion on the autopilot's endpoint, with further links (`relay`) beside it.
+
+    speed: of a simulated vehicle's time over ours, where it does not wait for us; all that ages here ages in its time.
+    """
 
     def __init__(
         self,
@@ -60,6 +63,7 @@ class Companion:
         engage: bool = False,
         relays: tuple[Relay, ...] = (),
         signer: Signer | None = None,
+        speed: float = 1.0,
     ) -> None:
         run.mkdir(parents=True, exist_ok=True)
         self.plan = plan
@@ -67,6 +71,7 @@ class Companion:
         self.relays = relays
         self.lockstep = lockstep
         self.signer = signer
+        self._clock = clock.Clock(speed)
         self.flight: Flight = pipeline.start(plan)
         plain = isinstance(endpoint, UdpEndpoint) and not relays and signer is None
         self.lane = Lane(plan, lockstep) if plain and lane.serves(plan) else None
@@ -303,21 +308,21 @@ class Companion:
 
     def _run_live(self) -> None:
         started = last_heard = clock.monotonic_s()
-        greet_us = 0
+        greeted = -1.0
         guard = Guard(self.endpoint.sock) if isinstance(self.endpoint, UdpEndpoint) else None
         while True:
-            now_us = max(self._stamp_us, clock.wall_us())
-            if not self.flight.heartbeat_us and now_us - greet_us > 1_000_000:  # nobody yet: say that we are here
-                greet_us = now_us
+            now_us = max(self._stamp_us, self._clock.us())
+            if not self.flight.heartbeat_us and clock.monotonic_s() - greeted > 1.0:  # nobody yet: say that we are here
+                greeted = clock.monotonic_s()
                 self.endpoint.send(self._hello(now_us))
             arrived = self.endpoint.receive(0.0 if self._stop else self._wait_s(now_us))
             begun = clock.monotonic_s()
-            self._stamp_us = max(self._stamp_us, clock.wall_us())
+            self._stamp_us = max(self._stamp_us, self._clock.us())
             if guard and guard.saw(sum(address != self._address for _, address in arrived), self._address, begun):
                 self._say_flooded(guard)
             for data, address in arrived:
                 before = self.setpoints
-                self._stamp_us = max(self._stamp_us, clock.wall_us())  # of what waited behind others, too: it is that late
+                self._stamp_us = max(self._stamp_us, self._clock.us())  # of what waited behind others, too: it is that late
                 if not self._quick(data, address):
                     frames = self._frames(data, address)
                     if not frames:
@@ -355,7 +360,7 @@ class Companion:
     def _wait_s(self, now_us: int) -> float:
         if not self.flight.heartbeat_us:
             return 0.2
-        return min(_RELAY_S if self.relays else 0.2, max(0.0, 1e-6 * (self.flight.due_us - now_us)))
+        return min(_RELAY_S if self.relays else 0.2, max(0.0, 1e-6 * (self.flight.due_us - now_us) / self._clock.speed))
 
     def _complain(self, silent_s: float) -> None:
         if silent_s > _SILENCE_S and not self._said_silent:

@@ -31,11 +31,9 @@ class Pace(NamedTuple):
 
     speed: float | None
 
-    def sitl(self) -> list[str]:
+    def words(self) -> list[str]:
+        """On the command line of either program."""
         return ["--lockstep"] if self.speed is None else ["--speed", repr(self.speed)]
-
-    def companion(self) -> list[str]:
-        return ["--lockstep"] if self.speed is None else []
 
 
 class Flown(NamedTuple):
@@ -72,11 +70,11 @@ def fly(run: Path, pace: Pace, max_time_s: float, watch: Watcher, forward: str =
         begun = time.monotonic()
         sitl = _start(
             run, "sitl", ["--config", str(run / "sitl.toml"), "--socket-fd", str(sock.fileno()), "--log", str(run / "sitl.tlog"),
-                          "--exit-when-landed", repr(_LANDED_S), "--max-time", repr(max_time_s), *copies, *pace.sitl()], (sock.fileno(),))  # fmt: skip
+                          "--exit-when-landed", repr(_LANDED_S), "--max-time", repr(max_time_s), *copies, *pace.words()], (sock.fileno(),))  # fmt: skip
         companion = _start(
             run, "mavquad", ["--config", str(run / "companion.toml"), "--endpoint", endpoint, "--run", str(run), "--engage",
                              "--signing-state", str(run / "companion.signing"),
-                             *pace.companion()])  # fmt: skip
+                             *pace.words()])  # fmt: skip
     said = _Tail(run / "companion.txt")
     problems: list[str] = []
     try:

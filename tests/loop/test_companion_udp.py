@@ -105,6 +105,33 @@ def test_killed_and_started_again_it_takes_over_into_a_second_log(tmp_path, grou
     assert (tmp_path / "run" / "flight-2.tlog").stat().st_size > 10_000
 
 
+def test_at_a_speed_its_timers_run_in_vehicle_time(tmp_path, ground):
+    """A hundred seconds of HEARTBEATs, by their stamps, in a second or two."""
+    process = companion(tmp_path, ground.getsockname()[1], "--speed", "100")
+    _, address = ground.recvfrom(65535)
+    ground.sendto(wire.encode("HEARTBEAT", (2, 12, 0, 0, 4, 3), seq=0, system=1, component=1), address)
+    begun, beats = time.monotonic(), 0
+    while beats < 100:
+        beats += sum(type(m).__name__ == "HEARTBEAT" for _, m in wire.parse(ground.recvfrom(65535)[0]))
+    assert time.monotonic() - begun < 50.0
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=60)
+    assert process.returncode == 0
+    with (tmp_path / "run" / "flight.tlog").open("rb") as stream:
+        stamps = [t for t, frame in tlog.read(stream) if frame.component == 191 and frame.msgid == 0]
+    assert stamps[90] - stamps[0] >= 90_000_000
+
+
+@pytest.mark.parametrize(
+    ("words", "told"), [(["--speed", "0"], "expected 0.01 to 1000"), (["--speed", "2", "--lockstep"], "no speed")]
+)
+def test_a_speed_that_cannot_be_is_said(tmp_path, words, told):
+    process = companion(tmp_path, 1, *words)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert told in err
+
+
 def test_an_endpoint_that_never_answers_is_said_after_five_seconds_and_ctrl_c_leaves_cleanly(tmp_path, ground):
     process = companion(tmp_path, ground.getsockname()[1])
     ground.recvfrom(65535)

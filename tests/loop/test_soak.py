@@ -157,7 +157,9 @@ def test_a_long_flight_with_faults_at_ten_times_real_time(tmp_path, capsys):
     sitl = start(run, "sitl", "--config", run / "sitl.toml", "--endpoint", f"udpin:127.0.0.1:{port}", "--log", run / "sitl.tlog", "--speed", SPEED, *end)  # fmt: skip
     listener = Listener(port)
     there = f"udpout:127.0.0.1:{listener.front.getsockname()[1]}"
-    companion = start(run, "companion", "--config", run / "companion.toml", "--endpoint", there, "--run", run, "--engage")
+    companion = start(
+        run, "companion", "--config", run / "companion.toml", "--endpoint", there, "--run", run, "--engage", "--speed", SPEED
+    )
     seen = []
     try:
         while sitl.poll() is None and companion.poll() is None:
