@@ -2,7 +2,7 @@
 
 import math
 
-from mavquad import control_step, lifecycle, pipeline, wire
+from mavquad import control_step, lane, lifecycle, pipeline, wire
 from mavquad import flight as flights
 from mavquad.plan import Plan
 
@@ -24,6 +24,8 @@ def run(plan: Plan) -> int:
             f = f.clone()
             f.life = f.life._replace(state=lifecycle.STREAMING, armed=True, mode=6 << 16, autopilot=lifecycle.PX4)
             control_step.anchor(plan, f)
+    if lane.serves(plan):
+        lane.Lane(plan, lockstep=False)
     return steps
 
 
