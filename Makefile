@@ -2,10 +2,11 @@
 PYTHON ?= python3
 BIN := .venv/bin
 CLIENTS := .venv-clients
+PEERS := .venv-peers
 STAMP := .venv/.installed
 SCENARIO ?= gusty
 
-.PHONY: fly test test-page long soak flood mutate install test-clients fuzz lint clean mutate-limits
+.PHONY: fly test test-page long soak flood mutate install test-clients fuzz lint clean mutate-limits bench
 
 fly: install
 	@$(BIN)/mavquad versus $(SCENARIO)
@@ -56,6 +57,18 @@ $(CLIENTS)/.installed: requirements-clients.txt tests/clients/programs/package-l
 	 else echo "no npm: node-mavlink is left out"; fi
 	@touch $@
 
+BENCH ?=
+
+bench: install $(PEERS)/.installed  # speed beside the peers, which come into an environment of their own; BENCH="bulk --seconds 2" for a part
+	@$(BIN)/mavquad bench $(BENCH)
+
+$(PEERS)/.installed: requirements-peers.txt
+	@echo "installing the peers of mavquad bench into $(PEERS) (once; 1.5 GB)"
+	@test -x $(PEERS)/bin/python || $(PYTHON) -m venv $(PEERS)
+	@$(PEERS)/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-peers.txt \
+	    || echo "not all of them install here: mavquad bench says which are missing"
+	@touch $@
+
 mutate: install  # every sign of the observer turned around, one at a time: the fast tests must notice (an hour of CPU)
 	NUMBA_DISABLE_JIT=1 $(BIN)/python tests/observer_signs.py
 
@@ -70,4 +83,4 @@ fuzz: install  # 10 million mutated frames, 100 thousand mutated files, then ath
 	    PYTHONPATH=.venv-fuzz $(BIN)/python -m tests.fuzz.guided -max_total_time=$(FUZZ_GUIDED_S) -verbosity=0; fi
 
 clean:
-	rm -rf .venv .venv-fuzz $(CLIENTS) build *.egg-info
+	rm -rf .venv .venv-fuzz $(CLIENTS) $(PEERS) build *.egg-info

@@ -2,12 +2,15 @@
 
 import json
 import math
+import sys
+from pathlib import Path
 
 import pytest
 
 from mavquad import wire
+from mavquad.errors import ConfigError
 from mavquad.link.columns import Log
-from tools import bench
+from tools import bench, peers
 from tools.__main__ import main
 from tools.benches import Row, bulk, cpu_s, growth, live, reading
 
@@ -74,13 +77,39 @@ def test_the_live_contestants_fly_the_same_setpoint(tmp_path):
     assert told[0].q == pytest.approx(told[2].q, abs=1e-2)
 
 
-def test_the_limit_in_c_and_a_missing_peer_are_rows_whatever_happens(monkeypatch):
-    monkeypatch.delenv("MAVQUAD_PEERS", raising=False)
-    missing = bulk._rotorpy()
-    assert math.isnan(missing.value)
-    assert "not installed" in missing.note
+def test_the_limit_in_c_and_a_missing_peer_are_rows_whatever_happens(monkeypatch, tmp_path):
+    ours = Row("plant + attitude control", "ours", 2.0, "M steps/s")
+    for home, said in ((tmp_path, "is not installed"), (Path(sys.prefix), f"is missing in {sys.prefix}")):
+        monkeypatch.setenv("MAVQUAD_PEERS", str(home))
+        rows = [*bulk._rotorpy(ours), bulk._crazyflow(1000, 2, "rk4")]
+        assert [math.isnan(row.value) for row in rows] == [True, True]
+        assert [said in row.note and "make bench" in row.note for row in rows] == [True, True]
+        told = reading._child("fasttlogparser", tmp_path / "no.tlog")
+        assert said in told
     monkeypatch.setattr(bulk.shutil, "which", lambda name: None)
     assert "no C compiler" in bulk._limit().note
+
+
+def test_peers_live_beside_the_project_unless_told(monkeypatch, tmp_path):
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "python").symlink_to(sys.executable)
+    monkeypatch.delenv("MAVQUAD_PEERS", raising=False)
+    monkeypatch.setattr(peers, "_BESIDE", tmp_path)
+    assert peers.run("somebody", "import json, sys; print(json.dumps([sys.argv[1], 4]))", 7) == ["7", 4]
+    with pytest.raises(ConfigError, match="somebody failed: ZeroDivisionError"):
+        peers.run("somebody", "1 / 0")
+    monkeypatch.setenv("MAVQUAD_PEERS", str(tmp_path / "elsewhere"))
+    with pytest.raises(ConfigError, match="somebody is not installed: `make bench` brings it"):
+        peers.run("somebody", "")
+
+
+def test_ratios_are_over_the_peers_own_figures(monkeypatch):
+    monkeypatch.setattr(bulk.peers, "run", lambda peer, program, *words: [200.0, 400.0, 500.0])
+    plain, ratio = bulk._rotorpy(Row("plant + attitude control", "ours", 2.0, "M steps/s"))
+    assert plain.value == pytest.approx(400e-6)
+    assert "rounds 0.0002 to 0.0005" in plain.note
+    assert ratio.value == pytest.approx(5000.0)
+    assert "different physics" in ratio.note
 
 
 def test_growth_says_how_cost_grows():

@@ -1,13 +1,13 @@
-"""flights in bulk: plant steps a second of one vehicle and of many, beside RotorPy and a C-written limit; the physics beside each figure.
+"""flights in bulk: plant steps a second of one vehicle and of many, beside RotorPy, crazyflow and a C-written limit.
 
-A ratio between different physics says so. Peers live in an environment of their own (`python -m venv DIR`, `DIR/bin/pip install rotorpy`, then
-MAVQUAD_PEERS=DIR); one that is missing is said, nothing fails for want of it.
+The physics stands beside each figure; a ratio between different physics says so. Peers live in an environment of their own
+(`make bench`, tools/peers.py); one that is missing is said, nothing fails for want of it.
 """
 
-import json
 import math
 import os
 import shutil
+import statistics
 import subprocess
 import tempfile
 import time
@@ -15,7 +15,8 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
-from tools import scenarios
+from mavquad.errors import ConfigError
+from tools import peers, scenarios
 from tools.benches import Row
 from tools.bulk import setup
 
@@ -68,37 +69,15 @@ int main(void) {
   return 0;
 }
 """
-_ROTORPY = """
-import time, numpy as np, json
-from rotorpy.vehicles.crazyflie_params import quad_params
-from rotorpy.vehicles.multirotor import Multirotor
-v = Multirotor(quad_params)
-s = {k: np.array(x, dtype=float) for k, x in v.initial_state.items()}
-u = {"cmd_motor_speeds": np.full(4, quad_params["rotor_speed_max"] * 0.6)}
-for _ in range(20): s = v.step(s, u, 0.002)
-t = time.process_time(); n = 300
-for _ in range(n): s = v.step(s, u, 0.002)
-print(json.dumps(n / (time.process_time() - t)))
-"""
 
 
 def measure(seconds: float) -> list[Row]:
     """Ours from the bare rigid body to whole flights, then the others."""
-    rows = [*_single(seconds), _fleet(seconds), _many(seconds), _limit(), _rotorpy()]
-    ours, theirs = rows[1].value, rows[-1].value
-    if math.isfinite(theirs):
-        rows.append(
-            Row(
-                "plant + attitude control, ours over",
-                "RotorPy",
-                ours / theirs,
-                "times",
-                "different physics: see the lines above",
-            )
-        )
-    if math.isfinite(rows[-2].value) and "C" in rows[-2].who:
-        rows.append(Row("rigid-body step, share of", rows[-2].who, rows[0].value / rows[-2].value, "of 1"))
-    return rows
+    single, limit = _single(seconds), _limit()
+    rows = [*single, *_fleets(seconds), _many(seconds), limit]
+    if math.isfinite(limit.value):
+        rows.append(Row("rigid-body step, share of", limit.who, single[0].value / limit.value, "of 1"))
+    return [*rows, *_rotorpy(single[1])]
 
 
 def _single(seconds: float) -> list[Row]:
@@ -139,26 +118,51 @@ def _single(seconds: float) -> list[Row]:
     return [*rows, Row("whole flight, one vehicle", "ours, one core", 1e-6 * n / best, "M steps/s", physics)]
 
 
-def _fleet(seconds: float) -> Row:
-    """1000 vehicles, each of a seed of its own, moved on by one call over all cores."""
+def _fleets(seconds: float) -> list[Row]:
+    """1000 vehicles, each of a seed of its own, moved on by one call over all cores; crazyflow's between two halves of our rounds."""
     from tools.bulk import fleet
 
-    flights, steps = 1000, max(200, round(200 * seconds))
+    flights, steps, cores = 1000, max(200, round(200 * seconds)), os.cpu_count() or 1
     prepared = [setup.prepare(_resolved(1.0, seed)) for seed in range(1, flights + 1)]
     for p in prepared:
         setup.fly(p, setup.START_US + 3_000_000)
-    vehicles, best = fleet.gather(prepared), math.inf
-    for i in range(6):
+    vehicles = fleet.gather(prepared)
+    fleet.advance(vehicles, 1)
+
+    def round_() -> float:
         begun = time.perf_counter()
-        fleet.advance(vehicles, steps if i else 1)
-        best = min(best, time.perf_counter() - begun) if i else best
+        fleet.advance(vehicles, steps)
+        return 1e-6 * flights * steps / (time.perf_counter() - begun)
+
+    ours = [round_() for _ in range(4)]
+    theirs = [_crazyflow(flights, *contest) for contest in ((1, "euler"), (cores, "euler"), (cores, "rk4"))]
+    ours += [round_() for _ in range(4)]
+    what, mine = f"{flights} flights in one call, plant + attitude and rate loops", statistics.median(ours)
+    rows = [
+        Row(what, f"ours, {cores} cores", mine, "M steps/s", f"{_spread(ours)}; {_CONTROLLED}; wanted: 6 on 2 cores"),
+        *theirs,
+    ]
+    note = "different physics: see the lines above; wanted: 3"
+    return [*rows, *(Row(f"{what}, ours over", r.who, mine / r.value, "times", note) for r in theirs if math.isfinite(r.value))]
+
+
+def _crazyflow(flights: int, devices: int, integrator: str) -> Row:
+    """Its worlds, each a drone under attitude control: on one device as it comes, or spread over as many as there are cores."""
+    what = f"{flights} worlds in one call, first-principles dynamics + attitude control"
+    who = f"crazyflow, {integrator}, {devices} device{'s' if devices > 1 else ''}"
+    evaluations = {"euler": 1, "rk4": 4}[integrator]
+    physics = f"13 states + 4 rotor speeds, float32, {integrator} 2 ms ({evaluations} evaluation{'s' if evaluations > 1 else ''}, ours has 2)"
+    try:
+        rates = [1e-6 * rate for rate in peers.run("crazyflow", peers.CRAZYFLOW, flights, 200, devices, integrator)]
+    except ConfigError as problem:
+        return Row(what, who, math.nan, "M steps/s", str(problem))
     return Row(
-        f"{flights} flights in one call, plant + attitude and rate loops",
-        f"ours, {os.cpu_count()} cores",
-        1e-6 * flights * steps / best,
-        "M steps/s",
-        f"{_CONTROLLED}; wanted: 6 on 2 cores",
+        what, who, statistics.median(rates), "M steps/s", f"{_spread(rates)}; {physics}, drag, no wind, 500 Hz, jit on the CPU"
     )
+
+
+def _spread(values: list[float]) -> str:
+    return f"rounds {min(values):.3g} to {max(values):.3g}"
 
 
 def _many(seconds: float) -> Row:
@@ -219,19 +223,16 @@ def _limit() -> Row:
     )
 
 
-def _rotorpy() -> Row:
+def _rotorpy(ours: Row) -> list[Row]:
+    """RotorPy's vehicle, and ours over it."""
     what, who = "plant + motors, one vehicle", "RotorPy"
-    home = os.environ.get("MAVQUAD_PEERS", "")
-    python = Path(home) / "bin" / "python"
-    if not home or not python.exists():
-        return Row(what, who, math.nan, "M steps/s", "not installed: name an environment that has it in MAVQUAD_PEERS")
-    done = subprocess.run([str(python), "-c", _ROTORPY], capture_output=True, text=True)
-    if done.returncode:
-        return Row(what, who, math.nan, "M steps/s", f"failed: {done.stderr.strip().splitlines()[-1]}")
-    return Row(
-        what,
-        who,
-        1e-6 * json.loads(done.stdout),
-        "M steps/s",
-        "13 states + 4 motors, scipy RK45 adaptive, drag and rotor aerodynamics",
-    )
+    physics = "13 states + 4 motors, scipy RK45 adaptive, drag and rotor aerodynamics"
+    try:
+        rates = [1e-6 * rate for rate in peers.run("RotorPy", peers.ROTORPY)]
+    except ConfigError as problem:
+        return [Row(what, who, math.nan, "M steps/s", str(problem))]
+    rate, note = statistics.median(rates), "different physics: see the lines above; wanted: 2000"
+    return [
+        Row(what, who, rate, "M steps/s", f"{_spread(rates)}; {physics}"),
+        Row("plant + attitude control, ours over", who, ours.value / rate, "times", note),
+    ]

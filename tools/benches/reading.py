@@ -1,7 +1,7 @@
 """reading a tlog: find frames, check CRC, columns of every message; beside pymavlink and fasttlogparser.
 
 The log is made here: a million messages of eleven kinds in usual proportions, 64 MB. Every contestant runs in a process of its own; its peak
-memory is the process's own, the interpreter and its libraries included. fasttlogparser is measured where it is installed.
+memory is the process's own, the interpreter and its libraries included. fasttlogparser lives among the peers (tools/peers.py).
 """
 
 import json
@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mavquad import wire
-from mavquad.errors import LogError
+from mavquad.errors import ConfigError
+from tools import peers
 from tools.benches import Row
 
 MESSAGES = 1_000_000
@@ -85,6 +86,11 @@ def measure(seconds: float) -> list[Row]:
 
 def _child(who: str, log: Path) -> "Told | str":
     """What a contestant's own process measured, or why it could not."""
+    if who == "fasttlogparser":
+        try:
+            return Told(**peers.run(who, peers.FASTTLOGPARSER, log))
+        except ConfigError as problem:
+            return str(problem)
     command = [sys.executable, "-P", "-m", "tools.benches.reading", who, str(log)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -100,22 +106,14 @@ class Told(NamedTuple):
 
 
 def contest(who: str, path: Path) -> Told:
-    """Read a log in this process as one contestant would. Raises LogError where it is not installed."""
+    """Read a log in this process as one contestant would."""
     import resource
 
-    if who == "fasttlogparser":
-        try:
-            import fasttlogparser
-        except ImportError:
-            raise LogError("not installed: pip install fasttlogparser") from None
-    spent, messages, runs = [], 0, 1 if who in (*_SHARE, "ours, first run", "fasttlogparser") else 6
+    spent, messages, runs = [], 0, 1 if who in (*_SHARE, "ours, first run") else 6
     for _ in range(runs):
         start = time.process_time()
         if who == "pymavlink":
             messages = _pymavlink(path)
-        elif who == "fasttlogparser":
-            tables, _ = fasttlogparser.parseTLog(str(path))
-            messages = sum(len(next(iter(columns.values()))) for columns in tables.values())
         elif who == "ours, streaming":
             messages = _streaming(path)
         else:
@@ -152,7 +150,4 @@ def _pymavlink(path: Path) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        print(json.dumps(contest(sys.argv[1], Path(sys.argv[2]))._asdict()))
-    except LogError as problem:
-        raise SystemExit(str(problem)) from None
+    print(json.dumps(contest(sys.argv[1], Path(sys.argv[2]))._asdict()))
