@@ -10,43 +10,76 @@ from pathlib import Path
 
 import atheris
 
-with atheris.instrument_imports(include=["mavquad.wire", "mavquad.link.tlog", "mavquad.config", "mavquad.toml"]):
+with atheris.instrument_imports(
+    include=[
+        *("mavquad.wire", "mavquad.config", "mavquad.toml", "mavquad.pipeline", "mavquad.messages", "mavquad.lifecycle"),
+        *("mavquad.samples", "mavquad.autopilot_words", "mavquad.tunables", "mavquad.strangers", "mavquad.delayed"),
+        *("mavquad.link.tlog", "mavquad.link.signals"),
+    ]
+):
     from mavquad import config, wire
     from mavquad.link import tlog
+    from tests.fuzz import targets
 
 from mavquad.errors import ConfigError, LogError, WireError
 from mavquad.settings import Companion
 
-_SCRATCH = Path(tempfile.mkdtemp()) / "x.toml"
+_SCRATCH = Path(tempfile.mkdtemp())
+_TOML = _SCRATCH / "x.toml"
+STREAM, LOG, SETTINGS, PX4, ARDUPILOT = range(5)
 
 
 def one(data: bytes) -> None:
-    """A stream of frames, a log or a settings file, as the first byte says."""
+    """A stream of frames, a log, a settings file or what a companion in flight hears, as the first byte says."""
     if not data:
         return
-    kind, data = data[0] % 3, data[1:]
-    if kind == 0:
-        frames, refused, rest = wire.split(data)
-        assert sum(len(frame.raw) for frame in frames) + refused + len(rest) == len(data)
-        for frame in frames:
-            try:
-                wire.decode(frame)
-            except WireError:
-                assert frame.msgid not in wire.ID_SET
-    elif kind == 1:
+    kind, data = data[0] % 5, data[1:]
+    if kind == STREAM:
+        stream(data)
+    elif kind == LOG:
         try:
             for _ in tlog.read(io.BytesIO(data)):
                 continue
         except LogError:
             return
-    else:
-        _SCRATCH.write_bytes(data)
+    elif kind == SETTINGS:
+        _TOML.write_bytes(data)
         try:
-            config.load(_SCRATCH, Companion)
+            config.load(_TOML, Companion)
         except ConfigError:
             return
+    else:
+        targets.heard(data, kind == ARDUPILOT)
+
+
+def stream(data: bytes) -> None:
+    """No byte is lost, and what is found is decoded."""
+    frames, refused, rest = wire.split(data)
+    assert sum(len(frame.raw) for frame in frames) + refused + len(rest) == len(data)
+    for frame in frames:
+        try:
+            wire.decode(frame)
+        except WireError:
+            assert frame.msgid not in wire.ID_SET
+
+
+def seeds() -> Path:
+    """A folder of good inputs to begin with: every message, pieces of a log, a settings file."""
+    folder = _SCRATCH / "seeds"
+    folder.mkdir()
+    known = sorted(targets.pipeline_ids(targets.engaged(False).plan))
+    good = [bytes([LOG]) + targets.LOG[:2000], bytes([SETTINGS]) + targets.TOMLS["companion"][0].encode()]
+    for raw in targets.BANK:
+        msgid = int.from_bytes(raw[7:10], "little")
+        good.append(bytes([STREAM]) + raw)
+        if msgid in known:
+            said = targets.piece(known.index(msgid), 8, raw[10 : 10 + raw[1]])
+            good += [bytes([kind, state]) + 3 * said for kind in (PX4, ARDUPILOT) for state in range(4)]
+    for number, data in enumerate(good):
+        (folder / str(number)).write_bytes(data)
+    return folder
 
 
 if __name__ == "__main__":
-    atheris.Setup(sys.argv, one)
+    atheris.Setup([*sys.argv, str(seeds())], one)
     atheris.Fuzz()

@@ -98,7 +98,7 @@ class _Engaged:
 
 
 @functools.cache
-def _engaged(ardupilot: bool) -> _Engaged:
+def engaged(ardupilot: bool) -> _Engaged:
     return _Engaged("eskf-mpc", ArduCopter()) if ardupilot else _Engaged("pid", Autopilot())
 
 
@@ -110,7 +110,7 @@ _SETPOINTS = (wire.ID["SET_ATTITUDE_TARGET"], wire.ID["SET_POSITION_TARGET_LOCAL
 
 def handlers(chance: random.Random) -> int:
     """The pipeline: frames whose CRC is right and whose fields are junk, among good ones, in every state of its life."""
-    start = _engaged(chance.random() < 0.5)
+    start = engaged(chance.random() < 0.5)
     plan, count = start.plan, 0
     raws = [raw for raw in BANK if int.from_bytes(raw[7:10], "little") in pipeline_ids(plan)]
     for before in start.states:
@@ -153,6 +153,33 @@ def _words(chance: random.Random, names: list[str]) -> bytes:
         return wire.encode("PARAM_SET", (1, 191, chance.choice(names), value, 9), seq=0, system=255, component=190)
     asked = (1, 191, chance.choice((lifecycle.CMD_ENGAGE, lifecycle.CMD_LAND, 1)), 0, *(value,) * 7)
     return wire.encode("COMMAND_LONG", asked, seq=0, system=255, component=190)
+
+
+def heard(data: bytes, ardupilot: bool) -> None:
+    """Bytes as payloads in frames whose CRC is right: state, then again and again which message, from whom, how long, the payload."""
+    start = engaged(ardupilot)
+    plan = start.plan
+    flight = start.states[data[0] % len(start.states)] if data else start.states[0]
+    now_us, at = flight.arrival_us, 1
+    known = sorted(pipeline_ids(plan))
+    while at + 3 <= len(data):
+        msgid, who, size = known[data[at] % len(known)], data[at + 1], data[at + 2]
+        payload, at = data[at + 3 : at + 3 + size], at + 3 + size
+        source = (1, 1) if who < 192 else (255, 190)
+        head = bytes([wire.STX_V2, 0, 0, 0, 0, *source]) + msgid.to_bytes(3, "little")
+        now_us += 1000 * (who & 63)
+        for frame in wire.split(mutate.seal(head, payload or b"\0"))[0]:
+            if pipeline.accepts(plan, flight, frame):
+                continue
+            flight = pipeline.feed(plan, flight, now_us, frame)
+            judge_outbox(plan.settings, flight.outbox)
+            flight.outbox, flight.trace = [], []
+    judge_outbox(plan.settings, pipeline.advance(plan, flight, now_us + 2_000_000).outbox)
+
+
+def piece(number: int, who: int, payload: bytes) -> bytes:
+    """One message for `heard`: which of `pipeline_ids`, from whom and how long after the last, what it holds."""
+    return bytes([number, who, len(payload)]) + payload
 
 
 def pipeline_ids(plan: pipeline.Plan) -> set[int]:
@@ -248,7 +275,7 @@ def _by_columns(path: Path) -> tuple[list[tuple[int, bytes]], str]:
     return [(t_us, frame.raw) for t_us, frame in log.frames()], ""
 
 
-_TOMLS = {
+TOMLS = {
     "companion": (
         "observers = ['gsmo']\ncontroller = 'pid'\ntakeoff_m = 5.0\n[path]\nname = 'circle'\nduration_s = 20.0\n[limits]\n"
         "tilt_deg = 40.0\nthrust_max = 0.95\n[safety]\nfence_m = 100.0\n[link]\nsystem = 1\ntimesync_hz = 5.0\n",
@@ -269,7 +296,7 @@ def settings(chance: random.Random) -> int:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "x.toml"
         for _ in range(FILES):
-            words, load = _TOMLS[chance.choice(tuple(_TOMLS))]
+            words, load = TOMLS[chance.choice(tuple(TOMLS))]
             path.write_text(mutate.text(chance, words), encoding="utf-8")
             said = ""
             try:

@@ -56,6 +56,26 @@ def test_a_setpoint_that_is_not_finite_is_found():
         targets.judge_outbox(Companion(), [(0, raw)])
 
 
+@settings(max_examples=30)
+@given(
+    st.booleans(),
+    st.integers(0, 3),
+    st.lists(st.builds(targets.piece, st.integers(0, 255), st.integers(0, 255), st.binary(max_size=60)), max_size=12),
+)
+def test_whatever_bytes_a_companion_in_flight_hears_it_says_nothing_that_is_not_whole(ardupilot, state, pieces):
+    targets.heard(bytes([state]) + b"".join(pieces), ardupilot)
+
+
+def test_a_piece_reaches_its_handler(monkeypatch):
+    judged = []
+    monkeypatch.setattr(targets, "judge_outbox", lambda settings, outbox: judged.extend(outbox))
+    number = sorted(targets.pipeline_ids(targets.engaged(False).plan)).index(wire.ID["COMMAND_LONG"])
+    raw = wire.encode("COMMAND_LONG", (1, 191, 31_000, 0, *(0.0,) * 7), seq=0, system=255, component=190)
+    targets.heard(bytes([3]) + targets.piece(number, 200, raw[10:-2]), ardupilot=False)
+    answers = [m for _, out in judged for _, m in wire.parse(out) if type(m).__name__ == "COMMAND_ACK"]
+    assert [(m.command, m.result) for m in answers] == [(31_000, 3)]
+
+
 @given(st.lists(st.one_of(st.binary(max_size=40), st.sampled_from(targets.BANK)), max_size=8), st.integers(0, 400))
 def test_no_byte_is_lost_however_a_stream_is_cut(parts, cut):
     stream = b"".join(parts)
