@@ -28,6 +28,7 @@ _ZERO_US = 1_420_070_400_000_000  # 2015-01-01 in unix time
 _AHEAD = 6_000_000  # a minute is reserved, again when half of it is left
 _OLD = 6_000_000  # a stream never heard before may be a minute behind us
 _END = (1 << 48) - (1 << 40)  # timestamps beyond (the year 2100) leave no room to go on
+_LAST = _END + (1 << 39)  # a later one was never reserved
 _MAGIC = b"MQSIGN1\0"
 _HEAD, _SLOT = struct.Struct("<8sQ"), struct.Struct("<QQ")
 _STREAMS = 64
@@ -109,8 +110,15 @@ class Memory:
                 import fcntl
 
                 fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            about = os.fstat(self._fd)
+            if os.name == "posix" and (about.st_mode & 0o022 or about.st_uid != os.geteuid()):
+                self.close()
+                raise ConfigError(
+                    f"signing state {path}: mode {about.st_mode & 0o777:04o}, owner {about.st_uid}: others may turn its time back;"
+                    f" expected 0600 and your own: chmod 600 {path}, or give another file"
+                )
             old = os.read(self._fd, _SIZE)
-            if old and (len(old) != _SIZE or not old.startswith(_MAGIC)):
+            if old and (len(old) != _SIZE or not old.startswith(_MAGIC) or _HEAD.unpack_from(old)[1] > _LAST):
                 self.close()
                 raise ConfigError(f"{path}: {len(old)} bytes that are no signing state; move it away or give another file")
             os.ftruncate(self._fd, _SIZE)

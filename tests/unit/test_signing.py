@@ -192,3 +192,29 @@ def test_a_state_file_has_one_owner_and_must_be_one(tmp_path, key_file):
         open_signer(key_file, tmp_path / "text")
     with pytest.raises(ConfigError, match="cannot be kept"):
         open_signer(key_file, tmp_path / "none" / "state")
+
+
+@pytest.mark.parametrize("mode", [0o620, 0o602, 0o666])
+def test_a_state_file_that_others_can_turn_back_is_refused_with_the_command_that_helps(tmp_path, key_file, mode):
+    state = tmp_path / "state"
+    open_signer(key_file, state).close()
+    state.chmod(mode)
+    with pytest.raises(ConfigError, match=f"mode {mode:04o}, owner .*chmod 600 {state}"):
+        open_signer(key_file, state)
+    state.chmod(0o600)
+    open_signer(key_file, state).close()
+
+
+def test_a_spoiled_state_file_is_said_and_never_signed_with(tmp_path, key_file):
+    state = tmp_path / "state"
+    open_signer(key_file, state).close()
+    whole = state.read_bytes()
+    for reserved in (1 << 48, (1 << 64) - 1):
+        state.write_bytes(whole[:8] + reserved.to_bytes(8, "little") + whole[16:])
+        with pytest.raises(ConfigError, match="no signing state; move it away"):
+            open_signer(key_file, state)
+    end = (1 << 48) - (1 << 40)  # the last that is taken from others
+    state.write_bytes(whole[:8] + (end + 12_000_000).to_bytes(8, "little") + whole[16:])
+    late = open_signer(key_file, state)
+    assert stamp(late.sign(beat(component=191), NOW_US)) > end
+    late.close()
