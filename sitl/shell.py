@@ -11,6 +11,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, TextIO
 
+from mavquad import wire
 from mavquad.errors import ConfigError, FlightError, LinkError
 from mavquad.link import tlog
 from mavquad.link.signing import Signer
@@ -20,6 +21,7 @@ from sitl.simulation import Simulation
 
 Address = tuple[str, int]
 ANSWER_S = 10.0  # the partner's time for one barrier
+PEERS = 64  # addresses that are answered on one port
 _POLL_S = 0.2  # how soon a signal is noticed
 _AHEAD = 2  # barriers under way at most
 _SLICE_US = 4_000  # of vehicle time at a speed
@@ -33,6 +35,7 @@ class Port:
     def __init__(self, sock: socket.socket, name: str) -> None:
         self.socket, self.name = sock, name
         self.links: dict[Address, Link] = {}
+        self.full = False  # said
 
 
 class Ports:
@@ -112,15 +115,28 @@ class Ports:
                 break
             except ConnectionError:
                 continue
-            link = port.links.get(address)
+            link = port.links.get(address) or self._meet(port, address, data)
             if link is None:
-                link = port.links[address] = self._sim.open_link()
+                continue
             for copy, to in self._copies:
                 self._out(copy, data, to)
             if self._sim.receive(link, data):
                 return True
             flags = socket.MSG_DONTWAIT
         return False
+
+    def _meet(self, port: Port, address: Address, data: bytes) -> Link | None:
+        """A link for an address that speaks MAVLink, while there is room: whoever sends junk is not answered with a stream."""
+        if len(port.links) < PEERS and wire.datagram(data)[0]:
+            port.links[address] = self._sim.open_link()
+            return port.links[address]
+        if len(port.links) == PEERS and not port.full:
+            port.full = True
+            who = f"{address[0]}:{address[1]}"
+            print(f"sitl: {port.name}: {PEERS} addresses speak here, room for no more; {who} gets no answer", file=sys.stderr)
+        refused = self._sim.refused
+        refused["datagrams without an answer"] = refused.get("datagrams without an answer", 0) + 1
+        return None
 
     def _out(self, sock: socket.socket, data: bytes, address: Address) -> None:
         try:
