@@ -111,6 +111,9 @@ def main(argv: list[str] | None = None) -> int:
     except MavquadError as error:
         print(f"mavquad: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:  # before `Companion.run` takes the signal
+        print("mavquad: stopped by Ctrl-C", file=sys.stderr)
+        return 1
 
 
 if __name__ == "__main__":

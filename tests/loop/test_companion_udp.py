@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from mavquad import __main__ as companion_main
 from mavquad import wire
 from mavquad.link import tlog
 from tests.oracles.autopilot import Autopilot
@@ -213,3 +214,12 @@ def test_an_endpoint_that_cannot_be_opened_is_one_line(tmp_path, ground, endpoin
     assert done.returncode == 1
     assert said in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_ctrl_c_before_anything_has_begun_is_one_line(monkeypatch, capsys):
+    def interrupted(args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(companion_main, "run", interrupted)
+    assert companion_main.main(["--endpoint", "udpin:127.0.0.1:0"]) == 1
+    assert capsys.readouterr().err == "mavquad: stopped by Ctrl-C\n"
