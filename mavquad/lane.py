@@ -5,6 +5,10 @@ ordinary. A text, a fault, a timer, a person's request: the shell takes the flig
 is also what a replay does. So every `replay --verify` of such a flight compares the two.
 """
 
+import itertools
+import struct
+from typing import Any
+
 import numpy as np
 
 from mavquad import flat, lane_record, lane_tick, lifecycle, messages, wire
@@ -13,7 +17,8 @@ from mavquad.jit import COMPILED
 from mavquad.lane_tick import DONE, OTHER, TIMERS
 from mavquad.link.health import Source
 from mavquad.link.signing import SETUP_SIGNING
-from mavquad.plan import Plan
+from mavquad.plan import Plan, Stage
+from mavquad.signals import Attitude
 
 __all__ = ["DONE", "OTHER", "TIMERS", "Lane", "serves"]
 
@@ -36,11 +41,18 @@ def serves(plan: Plan) -> bool:
         settings.controller in ("pid", "pd")
         and plan.estimator.label == "direct"
         and plan.compensator is None
-        and not plan.observers
+        and settings.body_rates != "observer"
+        and all(_by_attitude(stage) for stage in plan.observers)
         and plan.imu_spared
         and settings.loop == "attitude"
         and COMPILED
     )
+
+
+def _by_attitude(observer: Stage) -> bool:
+    """Whether it takes attitudes and nothing else."""
+    uses = getattr(observer.module, "uses", None)
+    return uses is not None and tuple(uses(observer.gains)) == ("Attitude",)
 
 
 def _table(plan: Plan) -> np.ndarray:
@@ -65,7 +77,10 @@ class Lane:
         self._memory = lane_record.room()
         self._state = self._memory[lane_record.STATE_AT :]
         self._memory[lane_record.TABLE_AT : lane_record.LOG_AT].view(np.int16)[:] = _table(plan)
-        self._rows = self._memory[lane_record.ROWS_AT : lane_record.PLACES_AT].view(np.float64)
+        self._rows = self._memory[lane_record.ROWS_AT : lane_record.HEARD_AT].view(np.float64)
+        self._heard = self._memory[lane_record.HEARD_AT : lane_record.PLACES_AT].view(np.float64)
+        self._observers: tuple[Any, ...] = ()
+        self._rates = struct.Struct(f"<{3 * len(plan.observers)}d")
         self._tell(plan)
         self.log = self.sent = self.trace = b""
         self.stamp_us = self.setpoints = self.frames = 0
@@ -99,13 +114,16 @@ class Lane:
             self._tuned, self._target, self._autopilot = flight.tuned, life.target, life.autopilot
             self._tell(flight.tuned or self._plan)
         lane_record.load(self._state, flight, source)
+        self._observers = flight.observers
         self.inside = True
         return True
 
     def leave(self, flight: Flight) -> tuple[Flight, Source]:
         """The flight as it is now, from the one that was taken over, and the counter of frames."""
         self.inside = False
-        return lane_record.unload(self._state, flight)
+        left, source = lane_record.unload(self._state, flight)
+        left.observers = self._observers
+        return left, source
 
     def feed(self, data: bytes, arrival_us: int, due_us: int) -> int:
         """One datagram of the autopilot. DONE: `log`, `sent`, `trace`, `stamp_us`, `setpoints` and `frames` are what came of it.
@@ -114,7 +132,7 @@ class Lane:
         """
         if len(data) > lane_record.MOST_BYTES:
             return OTHER
-        verdict, self.stamp_us, logged, sent, rows, self.setpoints, self.frames = lane_tick.feed(
+        verdict, self.stamp_us, logged, sent, rows, self.setpoints, self.frames, heard = lane_tick.feed(
             self._memory, np.frombuffer(data, np.uint8), arrival_us, due_us, self._lockstep
         )
         if verdict == DONE:
@@ -122,4 +140,24 @@ class Lane:
             self.log = memory[log_at : log_at + logged].tobytes()
             self.sent = memory[sent_at : sent_at + sent].tobytes()
             self.trace = self._rows[: lane_record.COLUMNS * rows].tobytes()
+            if self._observers:
+                self._observe(heard)
         return int(verdict)
+
+    def _observe(self, heard: int) -> None:
+        """Tell the observers the attitudes of this datagram; a row of the trace ends with what they make of them."""
+        stages, n, width = self._plan.observers, lane_record.ATTITUDES, 8 * lane_record.COLUMNS
+        rows, at = [], 0
+        for k in range(heard):
+            stamp, w, x, y, z, *omega = self._heard[n * k : n * (k + 1)].tolist()
+            sample = Attitude(int(stamp) if stamp >= 0.0 else -1 - int(stamp), (w, x, y, z), (omega[0], omega[1], omega[2]))
+            self._observers = tuple(
+                [s.module.observe(s.gains, state, sample) for s, state in zip(stages, self._observers, strict=True)]
+            )
+            if stamp < 0.0:
+                rates = [
+                    s.module.predict(s.gains, state, sample.t_us)[1] for s, state in zip(stages, self._observers, strict=True)
+                ]
+                rows += [self.trace[at : at + width], self._rates.pack(*itertools.chain(*rates))]
+                at += width
+        self.trace = b"".join(rows)

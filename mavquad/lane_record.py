@@ -101,11 +101,12 @@ RING_END = RING_AT + (following.RECORD.fields["sent_count"][1]) // 8  # type: ig
 # the kernel's memory in one piece, since each array costs a call from Python a third of a microsecond: bytes of each part
 FIXED_BYTES, STATE_BYTES = FIXED.itemsize, RECORD.itemsize
 MOST_BYTES, MOST_FRAMES, MOST_ROWS, COLUMNS = 1 << 12, 128, 8, 46
+ATTITUDES = 8  # columns of what observers are told: stamp, quaternion, body rates
 _PARTS = {
     "fixed": FIXED_BYTES, "state": STATE_BYTES, "backup": STATE_BYTES, "table": 2 << 16, "log": 1 << 14, "own": 1 << 12,
-    "sent": 1 << 12, "rows": 8 * MOST_ROWS * COLUMNS, "places": 8 * MOST_FRAMES, "scratch": 128,
+    "sent": 1 << 12, "rows": 8 * MOST_ROWS * COLUMNS, "heard": 8 * MOST_FRAMES * ATTITUDES, "places": 8 * MOST_FRAMES, "scratch": 128,
 }  # fmt: skip
-(FIXED_AT, STATE_AT, BACKUP_AT, TABLE_AT, LOG_AT, OWN_AT, SENT_AT, ROWS_AT, PLACES_AT, SCRATCH_AT, END) = (
+(FIXED_AT, STATE_AT, BACKUP_AT, TABLE_AT, LOG_AT, OWN_AT, SENT_AT, ROWS_AT, HEARD_AT, PLACES_AT, SCRATCH_AT, END) = (
     0,
     *itertools.accumulate(-(-size // 64) * 64 for size in _PARTS.values()),
 )

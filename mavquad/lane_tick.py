@@ -12,11 +12,13 @@ from mavquad import flat, following, lane_wire, paths, position_age
 from mavquad.control import pid
 from mavquad.jit import kernel
 from mavquad.lane_record import (
+    ATTITUDES,
     BACKUP_AT,
     COLUMNS,
     FIXED,
     FIXED_AT,
     FIXED_BYTES,
+    HEARD_AT,
     LOG_AT,
     MOST_ROWS,
     OWN_AT,
@@ -54,7 +56,7 @@ _ZERO3 = (0.0, 0.0, 0.0)
 
 @kernel
 def feed(memory, data, arrival_us, due_us, lockstep):
-    """(verdict, arrival stamp, bytes of log, bytes to send, rows of trace, setpoints, frames) of one datagram.
+    """(verdict, arrival stamp, bytes of log, bytes to send, rows of trace, setpoints, frames, attitudes heard) of one datagram.
 
     memory: see `lane_record.room`; its state is as it was where the verdict is not DONE. data (n,) uint8. Lockstep: the datagram is a
     whole period and its barrier, whose stamp (not before arrival_us) is the arrival; TIMERS where something falls due by then.
@@ -73,26 +75,27 @@ def _feed(memory, data, arrival_us, due_us, lockstep):
     s = memory[STATE_AT:BACKUP_AT][:STATE_BYTES].view(RECORD)[0]
     table, places = memory[TABLE_AT:LOG_AT].view(np.int16), memory[PLACES_AT:SCRATCH_AT].view(np.int64)
     log, own, wire = memory[LOG_AT:OWN_AT], memory[OWN_AT:SENT_AT], memory[SENT_AT:ROWS_AT]
-    rows, scratch = memory[ROWS_AT:PLACES_AT].view(np.float64), memory[SCRATCH_AT:].view(np.float64)
+    heard = memory[HEARD_AT:PLACES_AT].view(np.float64)
+    rows, scratch = memory[ROWS_AT:HEARD_AT].view(np.float64), memory[SCRATCH_AT:].view(np.float64)
     body = scratch.view(np.uint8)
     frames, end = lane_wire.take(data, table, g.target_system, g.target_component, log, places)
     if frames <= 0:
-        return OTHER, arrival_us, 0, 0, 0, 0, 0
+        return OTHER, arrival_us, 0, 0, 0, 0, 0, 0
     barrier = frames
     if lockstep:
         barrier = frames - 1
         lane_wire.payload(log, places[barrier], body[:_TIMESYNC_BYTES])
         asked, sent_ns = scratch.view(np.int64)[0], scratch.view(np.int64)[1]
         if table[lane_wire.message_id(log, places[barrier])] >> 8 != TIMESYNC or asked != 0 or not 0 <= sent_ns < _END_NS:
-            return OTHER, arrival_us, 0, 0, 0, 0, 0
+            return OTHER, arrival_us, 0, 0, 0, 0, 0, 0
         stamp_us = EPOCH_US + sent_ns // 1000
         if stamp_us < arrival_us:
-            return OTHER, arrival_us, 0, 0, 0, 0, 0
+            return OTHER, arrival_us, 0, 0, 0, 0, 0, 0
         arrival_us = stamp_us
     if arrival_us >= due_us:
-        return TIMERS, arrival_us, 0, 0, 0, 0, 0
+        return TIMERS, arrival_us, 0, 0, 0, 0, 0, 0
     s.arrival_us = max(s.arrival_us, arrival_us)
-    written = count = setpoints = 0
+    written = count = setpoints = attitudes = 0
     for i in range(frames):
         at = places[i]
         lane_wire.stamped(log, at - STAMP, arrival_us)
@@ -102,6 +105,8 @@ def _feed(memory, data, arrival_us, due_us, lockstep):
         good, due = True, False
         if kind == ATTITUDE:
             good, due = _hear_attitude(g, s, log, at, scratch)
+            _told(s, heard[ATTITUDES * attitudes : ATTITUDES * (attitudes + 1)], due)
+            attitudes += 1
         elif kind == IMU:
             good = _hear_imu(s, log, at, scratch)
         elif kind == POSITION:
@@ -120,16 +125,16 @@ def _feed(memory, data, arrival_us, due_us, lockstep):
             good = False
         if due:
             if count == MOST_ROWS or not _control(g, s, rows[COLUMNS * count : COLUMNS * (count + 1)], scratch):
-                return OTHER, arrival_us, 0, 0, 0, 0, 0
+                return OTHER, arrival_us, 0, 0, 0, 0, 0, 0
             count += 1
             if s.flying:
                 written = _send(g, s, own, written, _SETPOINT, g.setpoint_extra, body, _SETPOINT_BYTES)
                 setpoints += 1
         if not good or written > own.size - 128:
-            return OTHER, arrival_us, 0, 0, 0, 0, 0
+            return OTHER, arrival_us, 0, 0, 0, 0, 0, 0
     sent = _gather(own, written, wire)
     end = _behind_barrier(log, places[barrier] - STAMP if lockstep else end, end, own, written, lockstep)
-    return DONE, arrival_us, end, sent, count, setpoints, frames
+    return DONE, arrival_us, end, sent, count, setpoints, frames, attitudes
 
 
 @kernel
@@ -356,6 +361,16 @@ def _hear_attitude(g, s, log, at, scratch):
     if not _punctual(g, s, t_us):
         return False, False
     return True, s.control_us == 0 or t_us - s.control_us >= g.control_us - s.control_gap_us // 2
+
+
+@kernel
+def _told(s, to, due):
+    """The newest attitude as observers are told it; its stamp from -1 downwards where a control step follows."""
+    to[0] = -1 - s.attitude_stamp_us if due else s.attitude_stamp_us
+    for i in range(4):
+        to[1 + i] = s.q_wxyz[i]
+    for i in range(3):
+        to[5 + i] = s.omega_rad_s[i]
 
 
 @kernel

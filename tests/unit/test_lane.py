@@ -100,6 +100,7 @@ def same_flight(a, b):
         if name not in ("outbox", "trace", "life", "following"):
             same(getattr(a, name), getattr(b, name), name)
     assert a.life == b.life
+    assert type(a.observers) is type(b.observers)
     assert a.following.follows == b.following.follows
     for name in ("axis", "rate", "t_us", "rule_rad", "apart_s", "together_s", "sent_count"):
         same(*(np.asarray(f.following.record.view(flights.following.RECORD)[name]) for f in (a, b)), name)
@@ -135,9 +136,11 @@ def both(plan, fast, f, source, data, arrival_us):
 
 @pytest.mark.parametrize("autopilot", [lifecycle.PX4, lifecycle.ARDUPILOT])
 @pytest.mark.parametrize("state", [lifecycle.ENGAGED, lifecycle.STREAMING, lifecycle.OBSERVING, lifecycle.RELEASED])
-@pytest.mark.parametrize("controller", ["pid", "pd"])
-def test_a_flight_is_the_same_to_the_last_bit(controller, state, autopilot):
-    plan = plan_of(controller=controller, path={"name": "circle"})
+@pytest.mark.parametrize(
+    ("controller", "observers"), [("pid", []), ("pd", []), ("pid", ["gsmo"]), ("pid", ["gsmo", "gsmo:variant=relay"])]
+)
+def test_a_flight_is_the_same_to_the_last_bit(controller, observers, state, autopilot):
+    plan = plan_of(controller=controller, observers=observers, path={"name": "circle"})
     f, rng, seq = engaged(plan, autopilot, state)
     source, fast, plain = health.Source((seq - 1) & 0xFF, 5, 1), lane.Lane(plan, False), 0
     taken = f
@@ -331,7 +334,8 @@ def test_gains_changed_in_flight_are_flown():
         {"controller": "eskf-mpc"},
         {"controller": "autopilot"},
         {"compensator": "asmf"},
-        {"observers": ["gsmo"]},
+        {"observers": ["gsmo", "gsmo:source=mocap"]},
+        {"observers": ["gsmo"], "body_rates": "observer"},
         {"estimator": "joint"},
     ],
 )
