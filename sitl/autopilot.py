@@ -326,11 +326,11 @@ class Autopilot(ABC):
 
 def quaternion_matrix(q: Any) -> tuple[float, ...] | None:
     """The rotation of a quaternion that came over the wire, or None where its length is not 1 within half a percent."""
-    norm = math.sqrt(sum(x * x for x in q))
+    w, x, y, z = q
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
     if not 0.995 < norm < 1.005:  # NaN fails too
         return None
-    w, x, y, z = (x / norm for x in q)
-    return rotation.from_quaternion((w, x, y, z))
+    return rotation.from_quaternion((w / norm, x / norm, y / norm, z / norm))
 
 
 def geodetic(p_ned_m: Any) -> tuple[int, int, float]:

@@ -35,6 +35,7 @@ class Port:
     def __init__(self, sock: socket.socket, name: str) -> None:
         self.socket, self.name = sock, name
         self.links: dict[Address, Link] = {}
+        self.timeout_s = -1.0  # what the socket was told last
         self.full = False  # said
 
 
@@ -107,7 +108,9 @@ class Ports:
     def _read(self, port: Port, timeout_s: float) -> bool:
         """One datagram, waited for; then whatever else is there."""
         flags = 0
-        port.socket.settimeout(timeout_s)
+        if timeout_s != port.timeout_s:
+            port.timeout_s = timeout_s
+            port.socket.settimeout(timeout_s)
         for _ in range(_ROUND):
             try:
                 data, address = port.socket.recvfrom(65536, flags)
@@ -189,21 +192,14 @@ class Run:
             ready_us = max(sim.t_us, (sent_us + period_us - delay_us) // dt_us * dt_us)
             free_us = answered_us + period_us + delay_us
             if ready_us <= free_us and sent_us - answered_us < _AHEAD * period_us and not self._over():
-                self._run_to(ready_us)
+                sim.run_to(ready_us)
                 sent_us += period_us
                 sim.barrier(sent_us)
                 self.ports.send(sent_us)
             else:
                 answered_us += period_us
                 self._await_answer(answered_us)
-        self._run_to(sent_us)  # the end of what was begun
-
-    def _run_to(self, t_us: int) -> None:
-        sim = self.sim
-        while sim.period_end_us <= t_us:
-            sim.run_period()
-            sim.record_period()
-        sim.run_until(t_us)
+        sim.run_to(sent_us)  # the end of what was begun
 
     def _await_answer(self, barrier_us: int) -> None:
         waited_s, since_s = 0.0, time.monotonic()

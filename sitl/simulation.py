@@ -22,7 +22,7 @@ from sitl.params import Table
 from sitl.ring import Ring
 from sitl.services import Services
 from sitl.vehicle import Vehicle
-from sitl.voice import Voice
+from sitl.voice import NOTHING, Voice, Wanted
 
 COMPANION = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 _HEARTBEAT, _TIMESYNC = wire.ID["HEARTBEAT"], wire.ID["TIMESYNC"]
@@ -182,16 +182,13 @@ class Simulation:
         until_us = min(now_us + 1, self._barriers[0]) if self._barriers else now_us + 1
         self._journal.flush(NEVER if last else self.epoch_us + until_us)
 
-    def run_until(self, t_us: int) -> None:
-        """Move on to t_us (a whole number of loop periods): plant, arrivals, modes and streams at their instants."""
+    def run_until(self, t_us: int, speak: bool = True) -> None:
+        """Move on to t_us (a whole number of loop periods): plant, arrivals, modes and streams at their instants. What streams say
+        at t_us itself may be left to the next call (`speak`)."""
         vehicle, links_, faults = self.vehicle, self.links, self.faults
         now_us = vehicle.t_us
         while now_us < t_us:
-            due_us = min(self._tick_us, faults.due_us)
-            for link in links_:
-                if link.up.due_us < due_us:
-                    due_us = link.up.due_us + 1
-            ring = links_[0].ring if len(links_) == 1 and self._reboot_us == NEVER else None
+            due_us, ring = self._called_us(), self._ring()
             if ring is None:
                 self._run(min(t_us, due_us, self._stream_us))
             else:
@@ -210,8 +207,26 @@ class Simulation:
                 self._services.tick()
                 self.autopilot.tick(now_us)
                 self._ask_time(now_us)
-            if now_us >= self._stream_us and (now_us >= t_us or ring is None or self._reboot_us != NEVER):
-                self._emit(now_us)  # else the next leap begins with it
+            # a leap begins with what streams say
+            if now_us >= self._stream_us and (ring is None or self._reboot_us != NEVER or (speak and now_us >= t_us)):
+                self._emit(now_us)
+
+    def run_to(self, t_us: int) -> None:
+        """Move on to t_us; every control period that ends by then is counted and recorded."""
+        while (end_us := self.period_end_us) <= t_us:
+            due_us, ring = self._called_us(), self._ring()
+            if ring is not None and (called_us := self._instant(due_us)) < end_us:
+                self.run_until(called_us, speak=False)
+            elif ring is not None and due_us > t_us > end_us and self._journal.kept:  # nobody is called before t_us
+                self.end_period()
+                wanted = end_us, self.epoch_us + end_us, self.misses, self.autopilot.engaged
+                while self.vehicle.t_us < t_us:
+                    self._leap(ring, t_us, due_us, wanted)
+                self.flush()
+            else:
+                self.run_period()
+                self.record_period()
+        self.run_until(t_us)
 
     def truth(self) -> Any:
         """The truth of this instant as a record (`told.TOLD`); the disturbance is the mean since the last call."""
@@ -264,19 +279,38 @@ class Simulation:
             return 0.0
         return {"px4": px4, "ardupilot": ardupilot}[self.config.personality].STREAMS_HZ.get(name, 0.0)
 
-    def _run(self, t_us: int) -> None:
-        """Move the vehicle to t_us, or to the loop's instant behind it."""
-        vehicle = self.vehicle
-        vehicle.run(max(1, -((vehicle.t_us - t_us) // vehicle.dt_us)))
+    def _called_us(self) -> int:
+        """When something other than a stream is due: a tick, a fault, an arrival."""
+        due_us = min(self._tick_us, self.faults.due_us)
+        for link in self.links:
+            if link.up.due_us < due_us:
+                due_us = link.up.due_us + 1
+        return due_us
 
-    def _leap(self, ring: Ring, t_us: int, due_us: int) -> None:
+    def _ring(self) -> Ring | None:
+        """Where kernels may put what streams say: of a single peer, while no restart is waited for."""
+        return self.links[0].ring if len(self.links) == 1 and self._reboot_us == NEVER else None
+
+    def _instant(self, t_us: int) -> int:
+        """The first of the loop's instants from t_us on, but behind this one."""
+        now_us, dt_us = self.vehicle.t_us, self.vehicle.dt_us
+        return now_us + max(1, -((now_us - t_us) // dt_us)) * dt_us
+
+    def _run(self, t_us: int) -> None:
+        """Move the vehicle to `_instant` of t_us."""
+        vehicle = self.vehicle
+        vehicle.run((self._instant(t_us) - vehicle.t_us) // vehicle.dt_us)
+
+    def _leap(self, ring: Ring, t_us: int, due_us: int, wanted: Wanted = NOTHING) -> None:
         """Move to t_us or, where anything but streams is due before, to that; what streams say on the way a kernel makes."""
-        vehicle, dt_us = self.vehicle, self.vehicle.dt_us
+        vehicle = self.vehicle
         now_us = vehicle.t_us
-        steps = max(1, -((now_us - min(t_us, due_us)) // dt_us))
-        last = due_us > now_us + steps * dt_us
+        until_us = self._instant(min(t_us, due_us))
+        steps, last = (until_us - now_us) // vehicle.dt_us, due_us > until_us
         self._voice.heed(self.autopilot)
-        rank, self._stream_us = self._voice.leap(ring, steps, last, self._all_laid_out(now_us))
+        rank, self._stream_us, truth = self._voice.leap(ring, steps, last, self._all_laid_out(now_us), wanted)
+        if truth:
+            self._journal.sent(wanted[1], truth)
         if rank >= 0:
             self._emit(vehicle.t_us, rank)
 

@@ -7,6 +7,8 @@ from sitl import frames, rotation
 from sitl.state import RATES, VEHICLE
 
 TARGET, GIVEN, SHAPED = 0, 1, 2
+TRUTHS = 2  # messages of the truth
+_COMPONENT = 25  # MAV_COMP_ID_USER1: truth has a sequence of its own
 TOLD = np.dtype(
     [
         # set by Python
@@ -67,15 +69,19 @@ def find_truth(vehicle, constants, told, t_us, misses, engaged):
 
 
 @kernel
-def write_truth(vehicle, constants, told, t_us, misses, engaged, messages, moves, words, more, sender, stamp_us, log):
-    """`find_truth`, and the records of ODOMETRY and DEBUG_FLOAT_ARRAY `truth` in `log`: where they end. sender: seq, system, component."""
+def write_truth(vehicle, constants, told, t_us, messages, moves, words, more, case, log):
+    """`find_truth`, and the log's records of the last messages of the tables, which are those of the truth: where they end in `log`.
+
+    case: (stamp, sequence, system, misses, engaged).
+    """
+    stamp_us, seq, system, misses, engaged = case
     find_truth(vehicle, constants, told, t_us, misses, engaged)
-    seq, system, component = sender
-    at = 0
-    for k in range(messages.shape[0]):
+    at, many = 0, messages.shape[0]
+    for k in range(many - TRUTHS, many):
         m = messages[k]
         body = log[at + frames.STAMP + 10 : at + frames.STAMP + 10 + m.length]  # where it goes untrimmed
         frames.payload(m, moves, words, more, body)
         at = frames.stamp(stamp_us, log, at)
-        at = frames.frame(body, m.length, m.msgid, m.extra, seq + k, system, component, log, at)
+        at = frames.frame(body, m.length, m.msgid, m.extra, seq, system, _COMPONENT, log, at)
+        seq += 1
     return at

@@ -15,8 +15,9 @@ from sitl.vehicle import Vehicle
 if TYPE_CHECKING:
     from sitl import config
 
-_COMPONENT = 25  # MAV_COMP_ID_USER1: truth has a sequence of its own
-_LOG = 1024  # bytes: room for the two records of the truth
+_LOG = 1024  # bytes: room for the records of the truth
+Wanted = tuple[int, int, int, bool]  # the truth: when, its stamp, misses so far, whether engaged
+NOTHING: Wanted = (-1, 0, 0, False)
 
 
 class Voice:
@@ -40,7 +41,7 @@ class Voice:
         plain = {
             name: telemetry.without_sensors(telemetry.LAYOUTS[name]) if name in telemetry.LAYOUTS else None for name in streams
         }
-        return frames.tables(plain, self._words)
+        return frames.tables({**plain, **telemetry.TRUTH}, self._words)
 
     def heed(self, autopilot: Autopilot) -> None:
         """What the kernels have to know of the autopilot before they speak."""
@@ -55,23 +56,23 @@ class Voice:
         self._echo = None
         self.told["booted_us"], self.told["echo"] = autopilot.boot_us, told.SHAPED if autopilot.shapes else told.TARGET
 
-    def leap(self, ring: Ring, steps: int, last: bool, all_laid_out: bool) -> tuple[int, int]:
+    def leap(self, ring: Ring, steps: int, last: bool, all_laid_out: bool, wanted: Wanted = NOTHING) -> tuple[int, int, bytes]:
         """Speak now, move on by at most `steps` and speak on the way, at the last of them where `last` says so.
 
         Returns (`leap.DONE`, FULL: some room was made, go on, or the number of a stream that Python has to make at this instant;
-        when the next stream is due).
+        when the next stream is due; the log's records of the truth, if its instant was passed).
         """
         vehicle = self._vehicle
         if ring.arrays is not self._heard:
             self._heard = ring.arrays
-            self._arguments = *vehicle.arrays, self.told.array, *ring.arrays, *self._blocks
-        span = vehicle.t_us, vehicle.at_once(steps), vehicle.dt_us, last, all_laid_out
-        made, rank, next_us = self._leap(*self._arguments, span)
+            self._arguments = *vehicle.arrays, self.told.array, *ring.arrays, *self._blocks, self._log
+        span = vehicle.t_us, vehicle.at_once(steps), vehicle.dt_us, last, all_laid_out, wanted[0]
+        made, rank, next_us, logged = self._leap(*self._arguments, span, self._case(*wanted[1:]))
         if made:
             vehicle.passed(made)
         if rank == leap.FULL:
             ring.room(len(ring.slots))
-        return rank, next_us
+        return rank, next_us, self._written(logged) if logged else b""
 
     def speak(self, ring: Ring, rank: int, all_laid_out: bool) -> int:
         """Queue what is due now from stream `rank` on; what it returns is as of `leap`."""
@@ -86,24 +87,16 @@ class Voice:
 
     def truth(self, stamp_us: int, misses: int, engaged: bool) -> bytes:
         """The log's records of this instant's truth."""
-        v, messages, moves = self._vehicle, *self._truth
-        sender = self._said, self._system, _COMPONENT
-        self._said = (self._said + len(messages)) & 0xFF
-        end = told.write_truth(
-            v.state.array,
-            v.constants.array,
-            self.told.array,
-            v.t_us,
-            float(misses),
-            float(engaged),
-            messages,
-            moves,
-            *self._blocks,
-            sender,
-            stamp_us,
-            self._log,
-        )
-        return self._log[:end].tobytes()
+        v, case = self._vehicle, self._case(stamp_us, misses, engaged)
+        state, constants, voice = v.state.array, v.constants.array, self.told.array
+        return self._written(told.write_truth(state, constants, voice, v.t_us, *self._truth, *self._blocks, case, self._log))
+
+    def _case(self, stamp_us: int, misses: int, engaged: bool) -> tuple[int, int, int, float, float]:
+        return stamp_us, self._said, self._system, float(misses), float(engaged)
+
+    def _written(self, size: int) -> bytes:
+        self._said = (self._said + told.TRUTHS) & 0xFF
+        return self._log[:size].tobytes()
 
     def find_truth(self, misses: int, engaged: bool) -> Record:
         """The truth of this instant, in a record."""
