@@ -48,6 +48,7 @@ _SETPOINT_BYTES, _TIMESYNC_BYTES = 39, 18
 _BEHIND_US, _OLD_US, _USUAL_S, _SPARED_US, _DOUBLED_US, _OVER_US = 500_000, 60_000, 2.0, 12_000, 500_000, 1_000_000
 _BATTERY_AT = 30  # in the payload of SYS_STATUS
 _END_NS = 1 << 61
+SAME_CLOCK_US = 2_000_000  # as in `messages`
 _LATE_S = LATE_S[0]
 _FADE_S = 3.0
 _NAN3 = (math.nan, math.nan, math.nan)
@@ -218,7 +219,7 @@ def _hear_time(g, s, log, at, scratch, answers):
     lane_wire.payload(log, at, scratch.view(np.uint8)[:_TIMESYNC_BYTES])
     numbers = scratch.view(np.int64)
     now_ns = (s.arrival_us - EPOCH_US) * 1000
-    if not -_END_NS < numbers[1] < _END_NS:
+    if not -_END_NS < numbers[1] < _END_NS or not -_END_NS < numbers[0] < _END_NS:
         return False, False
     if numbers[0] == 0:
         numbers[0] = now_ns
@@ -228,6 +229,9 @@ def _hear_time(g, s, log, at, scratch, answers):
     round_trip_s = 1e-9 * (now_ns - numbers[1])
     if 0.0 <= round_trip_s < 2.0:
         s.delay_s += (round_trip_s - s.delay_s) * (0.1 if s.delay_s != 0.0 else 1.0)
+        answered_us = numbers[0] // 1000
+        if abs(answered_us - s.now_us) < SAME_CLOCK_US:
+            s.lateness_us = max(s.lateness_us, EPOCH_US + numbers[1] // 1000 - answered_us)
     return True, False
 
 

@@ -13,6 +13,8 @@ from mavquad.wire import Frame
 
 _DOES_NOT_EXIST = 1  # MAV_PARAM_ERROR
 
+SAME_CLOCK_US = 2_000_000  # between an answer and the newest sample, where both are by one clock
+
 
 def _heartbeat(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
     known = f.life.target != (0, 0)
@@ -52,6 +54,17 @@ def _timesync(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:
         round_trip_s = 1e-9 * (publish.nanoseconds(f.arrival_us) - m.ts1)
         if 0.0 <= round_trip_s < 2.0 and f.slow < 2:  # a late companion measures itself
             f.delay_s += (round_trip_s - f.delay_s) * (0.1 if f.delay_s else 1.0)
+        if 0.0 <= round_trip_s < 2.0:
+            _set_apart(f, publish.arrival_us(m.ts1), m.tc1 // 1000)
+
+
+def _set_apart(f: Flight, asked_us: int, answered_us: int) -> None:
+    """The autopilot's clock showed answered_us after we asked: no sample is stamped earlier against ours than that.
+
+    A simulated vehicle's clock that stood still, or runs slower than ours, would else pass for our own lateness.
+    """
+    if abs(answered_us - f.now_us) < SAME_CLOCK_US:
+        f.lateness_us = max(f.lateness_us, asked_us - answered_us)
 
 
 def _param_value(plan: Plan, f: Flight, frame: Frame, m: Any) -> None:

@@ -68,6 +68,11 @@ def nanoseconds(arrival_us: int) -> int:
     return (arrival_us - EPOCH_US) * 1000
 
 
+def arrival_us(nanoseconds: int) -> int:
+    """The arrival stamp that `nanoseconds` was made of."""
+    return EPOCH_US + nanoseconds // 1000
+
+
 def trace_names(observers: tuple[str, ...], compensator: Any) -> tuple[str, ...]:
     """The columns of a trace row."""
     names = list(_BASE)

@@ -81,6 +81,27 @@ def test_one_flight_through_stalls_of_50_to_500_ms_and_back_in_time():
     assert said[-1] == "mavquad: in time again"
 
 
+def test_a_vehicle_clock_that_stood_still_is_no_lateness_of_ours():
+    """A simulator that its machine left alone for 0.3 s. What looks late is so for a TIMESYNC's time, not for a minute."""
+    late = engaged("pid")
+    late.halted_us = lambda: 300_000
+    late.run(0.1)
+    assert late.flight.late_s > 0.25
+    late.run(8.0)
+    assert late.flight.late_us == 0
+    assert late.flight.slow == 0
+    flown_well(late, 1.0, 0.1)
+
+
+def test_a_simulator_at_two_thirds_of_real_time_is_flown():
+    late = engaged("pid")
+    began_us = late.sim.t_us
+    late.halted_us = lambda: (late.sim.t_us - began_us) // 2
+    late.run(10.0)
+    flown_well(late, 5.0, 0.15)
+    assert not any("too late" in text for text in late.texts)
+
+
 def test_a_stall_of_a_second_is_survived_or_given_back():
     """The autopilot's own failsafe takes over after a second; we never fight it, and never come back as if nothing had been."""
     late = engaged("pid")

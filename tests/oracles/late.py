@@ -44,6 +44,7 @@ class Late:
         self.flight = pipeline.start(self.plan)
         self.wakes, self.frame_us, self.buffer = wakes, frame_us, buffer
         self.next_us = 0.0
+        self.halted_us = lambda: 0  # for how long the vehicle's clock has stood still so far, by ours
         self.waiting = []
         self.texts, self.setpoints, self.errors, self.truth = [], [], [], []
         self.lost = 0
@@ -77,7 +78,7 @@ class Late:
         arrived, self.waiting = self.waiting, []
         for data in arrived:
             frames = wire.split(data)[0]
-            stamp = EPOCH_US + round(now_us)
+            stamp = self._stamp(now_us)
             accepted = [f for f in frames if not pipeline.accepts(self.plan, self.flight, f)]
             self._emit(pipeline.advance(self.plan, self.flight, stamp))
             self._emit(pipeline.feed_all(self.plan, self.flight, stamp, accepted))
@@ -86,8 +87,11 @@ class Late:
                 rest = arrived[arrived.index(data) + 1 :]
                 self.waiting = rest
                 break
-        self._emit(pipeline.advance(self.plan, self.flight, EPOCH_US + round(now_us)))
+        self._emit(pipeline.advance(self.plan, self.flight, self._stamp(now_us)))
         self.next_us = max(now_us, float(self.wakes(self.sim.t_us)))
+
+    def _stamp(self, now_us):
+        return EPOCH_US + round(now_us) + self.halted_us()
 
     def _emit(self, flight):
         self.flight = flight
