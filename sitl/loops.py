@@ -13,7 +13,7 @@ from sitl import rotation, rotors, shaping
 from sitl.plant import GRAVITY_M_S2
 from sitl.state import ARDUPILOT, ATTITUDE, CLIMB, IDLE, OFF, POSITION, RATES
 
-_YAW_SHARE = 0.4  # of the mean thrust at most goes into yaw
+YAW_SHARE = 0.4  # of the mean thrust at most goes into yaw
 _INTEGRAL_RAD_S2 = 30.0  # bound of the rate integral, as an angular acceleration
 _ACCEL_FEED = 0.7  # of a shaped target's own acceleration: the rate error behind the gyro's filter asks for the rest
 _LIFT_FLOOR = 0.1  # of gravity: the position loop never asks for less
@@ -147,8 +147,7 @@ def _attitude(s, sp, c):
     e = rotation.log(rotation.mul_t(A, D))
     yaw_rate = sp.rates_rad_s[2] if sp.kind == ATTITUDE else 0.0
     for i in range(3):
-        wanted = c.attitude_p[i] * e[i] + yaw_rate * A[6 + i]
-        s.target_rates_rad_s[i] = min(c.rate_limit[i], max(-c.rate_limit[i], wanted))
+        s.target_rates_rad_s[i] = towards(c.attitude_p[i], e[i], yaw_rate * A[6 + i], c.rate_limit[i])
     for i in range(9):
         s.target_R[i] = D[i]
 
@@ -158,13 +157,9 @@ def _rates(s, c):
     w = (s.rates_rad_s[0], s.rates_rad_s[1], s.rates_rad_s[2])
     J = (c.tuned_inertia[0], c.tuned_inertia[1], c.tuned_inertia[2])
     a0, a1, a2 = _spin(s, c, 0), _spin(s, c, 1), _spin(s, c, 2)
-    tau = (
-        J[0] * a0 + (J[2] - J[1]) * w[1] * w[2],
-        J[1] * a1 + (J[0] - J[2]) * w[2] * w[0],
-        J[2] * a2 + (J[1] - J[0]) * w[0] * w[1],
-    )
+    tau = torque(J, w, (a0, a1, a2))
     full = c.tuned_thrust_max_n
-    T = rotors.allocate(c.allocation, 4.0 * full * s.lift, tau, _YAW_SHARE, c.idle * full, full)
+    T = rotors.allocate(c.allocation, 4.0 * full * s.lift, tau, YAW_SHARE, c.idle * full, full)
     for i in range(4):
         s.outputs[i] = T[i] / full
         s.pwm_us[i] = int(1000.5 + 1000.0 * s.outputs[i])
@@ -173,9 +168,33 @@ def _rates(s, c):
 @kernel
 def _spin(s, c, i):
     """Wanted angular acceleration of one axis."""
+    slope, feed, integral = s.rates_slope[i], s.target_accel_rad_s2[i], s.rate_integral[i]
     error = s.target_rates_rad_s[i] - s.rates_rad_s[i]
-    alpha = _ACCEL_FEED * s.target_accel_rad_s2[i] + c.rate_p[i] * error + s.rate_integral[i] - c.rate_d[i] * s.rates_slope[i]
+    alpha, moved = spin(error, slope, feed, integral, c.rate_p[i], c.dt_s * c.rate_i[i], c.rate_d[i])
     if not s.grounded:
-        moved = s.rate_integral[i] + c.dt_s * c.rate_i[i] * error
-        s.rate_integral[i] = min(_INTEGRAL_RAD_S2, max(-_INTEGRAL_RAD_S2, moved))
+        s.rate_integral[i] = moved
     return alpha
+
+
+# ---- the arithmetic of an axis: floats, or `tools.bulk.lanes` -----------------------------------------------------------------
+@kernel
+def towards(p, e, yaw, limit):
+    """Wanted rate of one axis, from the angle e that is still to be turned."""
+    return min(limit, max(-limit, p * e + yaw))
+
+
+@kernel
+def spin(error, slope, feed, integral, p, i_dt, d):
+    """(wanted angular acceleration of one axis, its integral afterwards)."""
+    alpha = _ACCEL_FEED * feed + p * error + integral - d * slope
+    return alpha, min(_INTEGRAL_RAD_S2, max(-_INTEGRAL_RAD_S2, integral + i_dt * error))
+
+
+@kernel
+def torque(J, w, alpha):
+    """Torques that turn a body of inertia J at rates w with these accelerations."""
+    return (
+        J[0] * alpha[0] + (J[2] - J[1]) * w[1] * w[2],
+        J[1] * alpha[1] + (J[0] - J[2]) * w[2] * w[0],
+        J[2] * alpha[2] + (J[1] - J[0]) * w[0] * w[1],
+    )

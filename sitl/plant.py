@@ -21,14 +21,8 @@ _LEGS_1_S = 10.0
 @kernel
 def rates_of_change(v, R, w, T0, wind, p_gust, q_gust, c):
     """(v', w', f, alpha): accelerations and the disturbance part of each; T0 (4,) thrusts in still air, c the constants."""
-    m = c.mass_kg
-    ax, ay, az = apply_t(R, (wind[0] - v[0], wind[1] - v[1], wind[2] - v[2]))  # air relative to the body
-    speed = math.sqrt(ax * ax + ay * ay + az * az)
-    drag = (
-        (c.drag_linear[0] + c.drag_quadratic[0] * speed) * ax,
-        (c.drag_linear[1] + c.drag_quadratic[1] * speed) * ay,
-        (c.drag_linear[2] + c.drag_quadratic[2] * speed) * az,
-    )
+    air = apply_t(R, (wind[0] - v[0], wind[1] - v[1], wind[2] - v[2]))  # relative to the body
+    ax, ay, az = air
     if c.rotor_model == rotors.NO_INFLOW:
         T = (
             c.effectiveness[0] * T0[0],
@@ -43,6 +37,20 @@ def rates_of_change(v, R, w, T0, wind, p_gust, q_gust, c):
             c.effectiveness[2] * _inflow(T0[2], 2, ax, ay, az, p_gust - w[0], q_gust - w[1], c),
             c.effectiveness[3] * _inflow(T0[3], 3, ax, ay, az, p_gust - w[0], q_gust - w[1], c),
         )
+    return under(R, w, air, T0, T, c)
+
+
+@kernel
+def under(R, w, air, T0, T, c):
+    """`rates_of_change` in the air relative to the body, under thrusts T (T0 in still air); floats, or `tools.bulk.lanes`."""
+    ax, ay, az = air
+    m = c.mass_kg
+    speed = math.sqrt(ax * ax + ay * ay + az * az)
+    drag = (
+        (c.drag_linear[0] + c.drag_quadratic[0] * speed) * ax,
+        (c.drag_linear[1] + c.drag_quadratic[1] * speed) * ay,
+        (c.drag_linear[2] + c.drag_quadratic[2] * speed) * az,
+    )
     U, tx, ty, tz = rotors.wrench(c.x_m, c.y_m, c.spin, c.torque_per_thrust_m, T)
     U0, tx0, ty0, tz0 = rotors.wrench(c.x_m, c.y_m, c.spin, c.torque_per_thrust_m, T0)
     fx, fy, fz = apply(R, (drag[0], drag[1], drag[2] - (U - U0)))
@@ -73,15 +81,14 @@ def step(s, c):
     R = rotation.matrix(s.R)
     wind = (s.wind_ned_m_s[0], s.wind_ned_m_s[1], s.wind_ned_m_s[2])
     T = (s.thrust_n[0], s.thrust_n[1], s.thrust_n[2], s.thrust_n[3])
-    keep = math.exp(-0.5 * dt / c.lag_s) if c.lag_s > 0.0 else 0.0
-    T_mid = _lagged(T, s.outputs, c.thrust_max_n, keep)
-    T_end = _lagged(T_mid, s.outputs, c.thrust_max_n, keep)
+    keep = kept(dt, c.lag_s)
+    T_mid = lagged(T, s.outputs, c.thrust_max_n, keep)
+    T_end = lagged(T_mid, s.outputs, c.thrust_max_n, keep)
     p_gust, q_gust = s.gust[3], s.gust[4]
 
     k1, j1, _, _ = rates_of_change(v, R, w, T, wind, p_gust, q_gust, c)
     h = 0.5 * dt
-    v_mid = (v[0] + h * k1[0], v[1] + h * k1[1], v[2] + h * k1[2])
-    w_mid = (w[0] + h * j1[0], w[1] + h * j1[1], w[2] + h * j1[2])
+    v_mid, w_mid = after(v, k1, h), after(w, j1, h)
     R_mid = rotation.mul(R, rotation.exp((h * w[0], h * w[1], h * w[2])))
     k2, j2, f, alpha = rates_of_change(v_mid, R_mid, w_mid, T_mid, wind, p_gust, q_gust, c)
 
@@ -107,18 +114,37 @@ def step(s, c):
         s.accel_ned_m_s2[i] = k2[i]
     for i in range(4):
         s.thrust_n[i] = T_end[i]
+    meet_ground(s, c)
+    s.step += 1
+
+
+@kernel
+def meet_ground(s, c):
+    """What sinks below the ground stands on it."""
     if s.p_ned_m[2] > c.ground_d_m and s.v_ned_m_s[2] >= 0.0:
         s.impact_m_s = s.v_ned_m_s[2]
         s.grounded = 1
         s.p_ned_m[2] = c.ground_d_m
         for i in range(3):
-            s.accel_ned_m_s2[i] -= s.v_ned_m_s[i] / dt
+            s.accel_ned_m_s2[i] -= s.v_ned_m_s[i] / c.dt_s
             s.v_ned_m_s[i] = 0.0
-    s.step += 1
 
 
 @kernel
-def _lagged(T, outputs, full, keep):
+def after(x, slope, dt):
+    """A vector x of three, moved on along its slope; floats, or `tools.bulk.lanes`."""
+    return (x[0] + dt * slope[0], x[1] + dt * slope[1], x[2] + dt * slope[2])
+
+
+@kernel
+def kept(dt, lag_s):
+    """Share of a rotor's distance from what is asked of it that is left after half a step."""
+    return math.exp(-0.5 * dt / lag_s) if lag_s > 0.0 else 0.0
+
+
+@kernel
+def lagged(T, outputs, full, keep):
+    """Thrusts after half a step under these outputs."""
     return (
         full * outputs[0] + keep * (T[0] - full * outputs[0]),
         full * outputs[1] + keep * (T[1] - full * outputs[1]),

@@ -62,13 +62,30 @@ def mul_t(A, B):
 @kernel
 def exp(r):
     """Rodrigues: the rotation by the vector r (angle about its own direction)."""
+    a, b = shares(square(r))
+    return turned(r, a, b)
+
+
+@kernel
+def square(r):
+    """The length of r, squared."""
     x, y, z = r
-    n2 = x * x + y * y + z * z
+    return x * x + y * y + z * z
+
+
+@kernel
+def shares(n2):
+    """sin n/n and (1 - cos n)/n^2 of an angle n, from its square."""
     if n2 < 1e-8:  # the series: its next term is below 1e-17
-        a, b = 1.0 - n2 / 6.0, 0.5 - n2 / 24.0
-    else:
-        n = math.sqrt(n2)
-        a, b = math.sin(n) / n, (1.0 - math.cos(n)) / n2
+        return 1.0 - n2 / 6.0, 0.5 - n2 / 24.0
+    n = math.sqrt(n2)
+    return math.sin(n) / n, (1.0 - math.cos(n)) / n2
+
+
+@kernel
+def turned(r, a, b):
+    """`exp` of r, whose `shares` are a and b."""
+    x, y, z = r
     return (
         1.0 - b * (y * y + z * z),
         b * x * y - a * z,

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from mavquad.errors import ConfigError
+from sitl import rotation, rotors
 from sitl.sensors import COLUMNS, sense
 from sitl.state import VEHICLE, Record
 from tools import scenarios
@@ -130,6 +131,33 @@ def test_each_vehicle_of_a_fleet_moves_as_it_would_alone():
     assert [together.vehicles[k : k + 1].tobytes() for k in range(35)] == alone
     assert len(set(alone)) == 35
     assert np.ptp(together.vehicles["p_ned_m"][:, 0]) > 0.01
+
+
+def test_vehicles_side_by_side_keep_their_bits_whatever_one_of_them_meets():
+    flights = [setup.prepare(resolve(seed=seed, controller="pid")) for seed in range(1, 25)]
+    for p in flights:
+        setup.fly(p, setup.START_US + 2_500_000)
+    v = [p.vehicle for p in flights]
+    v[2].constants["ground_d_m"] = v[2].state["p_ned_m"][2] + 0.03  # sinks to the ground on the way
+    v[2].setpoint["thrust"] = 0.3
+    v[3].constants["lag_s"] = 0.0
+    v[4].setpoint["R"] = rotation.from_euler(3.14, 0.3, 1.0)  # turns over, at rates beyond the sine's series
+    v[5].constants["effectiveness"], v[5].constants["push_nm"] = (0.8, 1.0, 1.1, 0.9), (0.05, -0.1, 0.02)
+    v[6].setpoint["rates_rad_s"] = (0.0, 0.0, 0.9)
+    v[7].constants["drag_quadratic"], v[7].constants["push_n"] = (0.1, 0.2, 0.3), (1.0, -2.0, 0.5)
+    v[8].constants["rotor_model"] = rotors.MODEL_G  # its eight go alone
+    together = fleet.gather(flights)
+    fleet.advance(together, 150, threads=1)
+    fleet.advance(together, 0, threads=1)
+    for p in flights:
+        rates.with_loops(p.vehicle.state.array, p.vehicle.setpoint.array, p.vehicle.constants.array, None, None, 150)
+    for k in range(24):
+        for name in VEHICLE.names:
+            assert together.vehicles[k : k + 1][name].tobytes() == v[k].state.array[name].tobytes(), (k, name)
+    assert [bool(grounded) for grounded in together.vehicles["grounded"]] == [k == 2 for k in range(24)]
+    assert together.vehicles["impact_m_s"][2] > 0.1
+    assert np.abs(together.vehicles["omega_rad_s"][4]).max() > 0.5
+    assert np.linalg.norm(together.vehicles["omega_rad_s"][6]) > 0.5
 
 
 def test_scores_are_those_of_a_flight_step_by_step():

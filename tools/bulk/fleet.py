@@ -1,7 +1,7 @@
-"""Many vehicles in one call: plant, attitude and rate loops of each, on all cores.
+"""Many vehicles in one call: plant, attitude and rate loops of each, on all cores; each moves exactly as it would alone.
 
-A step is one long chain of operations that wait for each other, and a processor could do two or three at a time: so a few vehicles
-take their steps in turn, and what one of them waits for another one fills. Each moves exactly as it would alone.
+Eight at a time go side by side in registers (`abreast.py`). Of the others a few take their steps in turn: a step is one long chain
+of operations that wait for each other, and what one vehicle waits for another one fills.
 """
 
 import os
@@ -11,11 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mavquad.jit import kernel_for_threads
-from tools.bulk import rates
+from mavquad.jit import COMPILED, kernel_for_threads
+from tools.bulk import abreast, rates
+from tools.bulk.lanes import WIDTH
 from tools.bulk.setup import Prepared
 
-_ABREAST = 4  # vehicles that take turns: more of them leave the first-level cache
+_TURNS = 4  # vehicles that take turns: more of them leave the first-level cache
 _PART = 32  # vehicles handed to a thread at once
 
 
@@ -47,11 +48,20 @@ def advance(fleet: Fleet, steps: int, threads: int | None = None) -> None:
 
 @kernel_for_threads
 def _part(vehicles, setpoints, constants, first, last, steps):
-    for left in range(first, last, _ABREAST):
-        right = min(last, left + _ABREAST)
+    left = first
+    while left < last and steps > 0:
+        together = COMPILED and left + WIDTH <= last
+        for k in range(left, min(last, left + WIDTH)):
+            together = together and abreast.fit(vehicles[k], setpoints[k], constants[k])
+        if together:
+            abreast.advance(vehicles, setpoints, constants, left, steps)
+            left += WIDTH
+            continue
+        right = min(last, left + _TURNS)
         for _ in range(steps):
             for k in range(left, right):
                 rates.step_on_truth(vehicles[k], setpoints[k], constants[k])
+        left = right
 
 
 def _together(records: list[np.ndarray]) -> np.ndarray:
