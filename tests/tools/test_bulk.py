@@ -150,7 +150,9 @@ def test_vehicles_side_by_side_keep_their_bits_whatever_one_of_them_meets():
     fleet.advance(together, 150, threads=1)
     fleet.advance(together, 0, threads=1)
     for p in flights:
-        rates.with_loops(p.vehicle.state.array, p.vehicle.setpoint.array, p.vehicle.constants.array, None, None, 150)
+        rates.with_loops(
+            p.vehicle.state.array, p.vehicle.setpoint.array, p.vehicle.constants.array, p.vehicle._gusts, p.noise.array, 150
+        )
     for k in range(24):
         for name in VEHICLE.names:
             assert together.vehicles[k : k + 1][name].tobytes() == v[k].state.array[name].tobytes(), (k, name)
