@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from typing import Any
 
 from mavquad import wire
-from mavquad.errors import WireError
 from mavquad.link.signing import SETUP_SIGNING, Signer
 from mavquad.wire import Frame
 from sitl import ardupilot, config, links, px4, telemetry
+from sitl.arrivals import Arrivals
 from sitl.autopilot import TICK_US, Autopilot, check_airframe
 from sitl.faults import Faults
 from sitl.helicopter import Helicopter
@@ -54,6 +54,7 @@ class Simulation:
         self._journal = Journal(record)
         self._period_us = 1000 * sitl.period_ms
         self._services = Services(self)
+        self._arrivals = Arrivals(self, self._services)
         self.faults = Faults(sitl.faults, self)
         self._reboot_us = NEVER
         self._silent_until_us = 0
@@ -101,7 +102,7 @@ class Simulation:
         link.refused += refused
         for frame in frames:
             if frame.msgid == SETUP_SIGNING:  # it carries a key: kept nowhere
-                self._refuse("a key sent over the link")
+                self.refuse("a key sent over the link")
                 continue
             if self.lockstep and not self._answered and self._is_start(link, frame):
                 continue
@@ -134,9 +135,14 @@ class Simulation:
             frames.append(self._frame(link, ("TIMESYNC", (0, barrier_ns)), t_us))
         return links.datagrams(frames)
 
+    @property
+    def silent(self) -> bool:
+        """The autopilot boots: it neither hears nor says anything."""
+        return self.t_us < self._silent_until_us
+
     def send(self, link: Link, name: str, fields: tuple[Any, ...]) -> None:
         """One message to one peer; none while the autopilot boots."""
-        if self.t_us >= self._silent_until_us:
+        if not self.silent:
             link.down.put(self.t_us, (name, fields))
 
     def say(self, severity: int, text: str) -> None:
@@ -201,7 +207,7 @@ class Simulation:
             for link in links_:
                 if link.up.due_us < now_us:  # what comes at this very instant is seen in the next turn of the loop
                     for arrived in link.up.take(now_us - 1, _as_it_is):
-                        self._arrived(link, arrived)
+                        self._arrivals.deliver(link, arrived)
             if now_us >= self._tick_us:
                 self._tick_us += TICK_US
                 self._services.tick()
@@ -374,13 +380,14 @@ class Simulation:
         """Whether a frame of the lockstep itself is not our partner's; its time is that of the barrier."""
         return self.signer is not None and self.signer.refuses(frame, self.epoch_us + self._said_us, new=False) != ""
 
-    def _refuse(self, reason: str) -> None:
+    def refuse(self, reason: str) -> None:
+        """Count a whole frame that was not taken."""
         self.refused[reason] = self.refused.get(reason, 0) + 1
 
     def _is_start(self, link: Link, frame: Frame) -> bool:
         """A companion repeats its first HEARTBEAT until time begins: one of them is kept, however often it came."""
         if self._forged(frame):
-            self._refuse("badly signed")
+            self.refuse("badly signed")
             return True
         if self.partner is None:
             if frame.msgid == _HEARTBEAT and frame.component == COMPANION:
@@ -397,50 +404,6 @@ class Simulation:
             link.up.put(self._hear(self._first_heartbeat), self._first_heartbeat)
             self._first_heartbeat = None
         return False
-
-    def _arrived(self, link: Link, arrived: Frame | bytes) -> None:
-        """One frame at the end of its wire (bytes, where the wire may have spoiled it): for us, for others, or both."""
-        if self.t_us < self._silent_until_us:
-            return
-        if isinstance(arrived, bytes):
-            frames, refused, rest = wire.split(arrived)
-            link.refused += refused + len(rest)
-        else:
-            frames = [arrived]
-        for frame in frames:
-            reason = self.signer.refuses(frame, self.epoch_us + self.t_us) if self.signer else ""
-            if reason:
-                self._refuse(reason)
-                continue
-            link.received += 1
-            link.speakers.add((frame.system, frame.component))
-            if frame.msgid not in wire.ID_SET:
-                self._forward(link, frame, 0, 0)
-                continue
-            try:
-                m = wire.decode(frame)
-            except WireError:
-                link.refused += 1
-                continue
-            system, component = getattr(m, "target_system", 0), getattr(m, "target_component", 0)
-            ours = system in (0, self.config.system) and component in (0, self.config.component)
-            if len(self.links) > 1 and not (ours and system and component):
-                self._forward(link, frame, system, component)
-            handler = self._services.handlers.get(frame.msgid) if ours else None
-            if handler is None:
-                continue
-            if self._services.allowed(frame):
-                handler(link, frame, m)
-            else:
-                self._refuse("not from a listed system")
-                self._services.deny(link, frame, m)
-
-    def _forward(self, source: Link, frame: Frame, system: int, component: int) -> None:
-        """To the links where the addressee was heard; to all others when it is for everybody."""
-        for link in self.links:
-            heard = any(s == system and component in (0, c) for s, c in link.speakers)
-            if link is not source and (system == 0 or heard):
-                link.down.put(self.t_us, frame.raw)
 
     def _ask_time(self, t_us: int) -> None:
         every_us = self.autopilot.timesync_us

@@ -99,7 +99,7 @@ def laid_out(sim: "Simulation", name: str) -> Callable[[], Fields]:
     clocks: dict[str, Callable[[], int]] = {
         "clock_us": lambda: v.t_us - sim.autopilot.boot_us,
         "clock_ms": lambda: (v.t_us - sim.autopilot.boot_us) // 1000,
-        "mocap_us": lambda: v.t_us - sim.autopilot.boot_us - sim.mocap_age_us,
+        "mocap_us": lambda: max(0, v.t_us - sim.autopilot.boot_us - sim.mocap_age_us),
     }
     parts: list[tuple[Callable[..., Any], tuple[Any, ...]]] = []
     for entry in LAYOUTS[name]:

@@ -41,7 +41,7 @@ def tell(s, sp, a, t_us):
     """The clocks, and the attitude that the loop is after."""
     a.clock_us = t_us - a.booted_us
     a.clock_ms = a.clock_us // 1000
-    a.mocap_us = a.clock_us - a.mocap_age_us
+    a.mocap_us = max(0, a.clock_us - a.mocap_age_us)  # the first samples after the start are as old as that
     a.type_mask = 128 if sp.kind == RATES and a.echo != SHAPED else 0
     if a.echo != GIVEN:
         q = rotation.to_quaternion(rotation.matrix(s.shaped_R if a.echo == SHAPED else s.target_R))

@@ -111,3 +111,12 @@ def test_the_truth_in_the_log_is_the_state_of_the_vehicle():
     assert np.linalg.norm(extra.data[:3]) > 0.1  # the wind
     assert s["summed"] == 0
     assert extra.data[10:] == (0.0, 0.0) + (0.0,) * 46
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.01])  # made by a kernel, made by Python
+def test_motion_capture_that_is_late_from_the_start_has_no_time_before_it(loss):
+    c = Client("attitude_source=mocap", "noise.mocap_delay_ms=25", "link.delay_ms=0", f"link.loss={loss}")
+    stamps = []
+    c.on = lambda m: stamps.append(m.time_usec) if type(m).__name__ == "ATT_POS_MOCAP" else None
+    c.run(0.1)
+    assert stamps[:4] == [0, 0, 5_000, 15_000]
