@@ -5,8 +5,10 @@ Types are msgspec Structs declared with `class X(Section)`; their `__post_init__
 
 import difflib
 import functools
+import math
 import re
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -41,13 +43,27 @@ def _parsed(path: Path, changed_ns: int) -> dict[str, Any]:
 
 
 def convert(data: dict[str, Any], kind: type[T], source: str) -> T:
-    """Plain tables as `kind`. Raises ConfigError that names source, key, value and what is allowed."""
+    """Plain tables as `kind`. Raises ConfigError that names source, key, value and what is allowed; nan and inf never are."""
+    for key, number in _not_finite(data):
+        raise ConfigError(f"{source}: {key} = {number}: expected a finite number")
     try:
         return msgspec.convert(data, kind)
     except msgspec.ValidationError as error:
         raise ConfigError(f"{source}: {_explain(str(error), data, kind)}") from None
     except ConfigError as error:
         raise ConfigError(f"{source}: {error}") from None
+
+
+def _not_finite(data: Any, at: str = "") -> Iterator[tuple[str, float]]:
+    """(key, number) of each nan and inf: no limit holds against them."""
+    if isinstance(data, float) and not math.isfinite(data):
+        yield at, data
+    elif isinstance(data, dict):
+        for key, inner in data.items():
+            yield from _not_finite(inner, f"{at}.{key}" if at else str(key))
+    elif isinstance(data, list | tuple):
+        for i, inner in enumerate(data):
+            yield from _not_finite(inner, f"{at}[{i}]")
 
 
 def load(path: Path, kind: type[T]) -> T:

@@ -34,6 +34,14 @@ class Link(config.Section, frozen=True):
     timesync_hz: float = 5.0
     publish_hz: float = 5.0
 
+    def __post_init__(self) -> None:
+        for key, least in (("system", 1), ("component", 1), ("target_system", 0)):
+            if not least <= getattr(self, key) <= 255:
+                raise ConfigError(f"link.{key} = {getattr(self, key)}: expected {least} to 255")
+        for key in ("timesync_hz", "publish_hz"):
+            if not 0.01 <= getattr(self, key) <= 100.0:
+                raise ConfigError(f"link.{key} = {getattr(self, key)}: expected 0.01 to 100 Hz")
+
 
 class Safety(config.Section, frozen=True):
     """[safety]: when to hold, level, release or land."""
@@ -47,6 +55,13 @@ class Safety(config.Section, frozen=True):
     ceiling_m: float = 120.0
     battery_percent: float = 15.0  # land below
     reset_m: float = 0.6  # a position jump that velocity cannot explain
+
+    def __post_init__(self) -> None:
+        for key in ("hold_s", "level_s", "release_s", "late_s", "delay_s", "fence_m", "ceiling_m", "reset_m"):
+            if not 0.0 < getattr(self, key) <= 1e6:
+                raise ConfigError(f"safety.{key} = {getattr(self, key)}: expected more than 0, at most 1e6")
+        if not 0.0 <= self.battery_percent <= 100.0:
+            raise ConfigError(f"safety.battery_percent = {self.battery_percent}: expected 0 to 100")
 
 
 class Companion(config.Section, frozen=True):
@@ -75,10 +90,12 @@ class Companion(config.Section, frozen=True):
     def __post_init__(self) -> None:
         if not 1.0 <= self.control_hz <= 1000.0:
             raise ConfigError(f"control_hz = {self.control_hz}: expected 1 to 1000")
+        if not 0.0 <= self.settle_s <= 600.0:
+            raise ConfigError(f"settle_s = {self.settle_s}: expected 0 to 600")
         if self.body_rates == "observer" and not self.observers:
             raise ConfigError('body_rates = "observer" needs one in observers, for instance "gsmo"')
         if not 0.5 <= self.takeoff_m <= 100.0:
             raise ConfigError(f"takeoff_m = {self.takeoff_m}: expected 0.5 to 100")
         for name, hz in self.link.rates_hz.items():
-            if not 0.0 < hz <= 1000.0:
-                raise ConfigError(f"link.rates_hz.{name} = {hz}: expected 0 to 1000 Hz")
+            if not 0.01 <= hz <= 1000.0:
+                raise ConfigError(f"link.rates_hz.{name} = {hz}: expected 0.01 to 1000 Hz")

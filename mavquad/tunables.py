@@ -4,6 +4,7 @@ A name is STAGE_FIELD in capitals without the unit, 16 characters at most (MAVLi
 """
 
 import dataclasses
+import math
 import re
 from typing import Any, NamedTuple
 
@@ -43,7 +44,9 @@ def tunables(plan: Plan) -> tuple[Tunable, ...]:
 
 
 def change(plan: Plan, name: str, value: float) -> Plan:
-    """The plan with one parameter changed. Raises ConfigError for an unknown name or a value its stage refuses."""
+    """The plan with one parameter changed. Raises ConfigError for an unknown name, no number, or a value its stage refuses."""
+    if not math.isfinite(value):
+        raise ConfigError(f"{name} = {value}: expected a finite number")
     for tunable in tunables(plan):
         if tunable.name == name:
             stage: Stage = getattr(plan, tunable.place)

@@ -14,6 +14,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from mavquad.errors import ConfigError
 from mavquad.jit import kernel
 
 
@@ -55,10 +56,20 @@ def lagged_model(dt_s: float, tau_s: float) -> Model:
 
 
 def terminal(model: Model, q: np.ndarray, r: float) -> np.ndarray:
-    """Terminal weight (n,n) with which any horizon gives the infinite one: the DARE's solution. q is the diagonal."""
+    """Terminal weight (n,n) with which any horizon gives the infinite one: the DARE's solution. q is the diagonal.
+
+    Raises ConfigError where these weights have none, or none in double precision.
+    """
     from scipy.linalg import solve_discrete_are
 
-    return np.asarray(solve_discrete_are(model.a, model.b[:, None], np.diag(q), np.array([[r]])))
+    try:
+        return np.asarray(solve_discrete_are(model.a, model.b[:, None], np.diag(q), np.array([[r]])))
+    except (np.linalg.LinAlgError, ValueError) as error:
+        weights = ", ".join(f"{x:g}" for x in q)
+        raise ConfigError(
+            f"no gain belongs to state weights {weights} and input weight {r:g}: {error}; expected them within about"
+            " 1e-12 to 1e12 of each other"
+        ) from None
 
 
 def lqr(model: Model, q: np.ndarray, r: float) -> np.ndarray:

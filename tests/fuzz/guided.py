@@ -6,24 +6,32 @@ Example: python -m tests.fuzz.guided -max_total_time=60      (libFuzzer's own op
 import io
 import sys
 import tempfile
+import types
 from pathlib import Path
 
 import atheris
 
-with atheris.instrument_imports(
-    include=[
-        *("mavquad.wire", "mavquad.config", "mavquad.toml", "mavquad.pipeline", "mavquad.messages", "mavquad.lifecycle"),
-        *("mavquad.samples", "mavquad.autopilot_words", "mavquad.tunables", "mavquad.strangers", "mavquad.delayed"),
-        *("mavquad.link.tlog", "mavquad.link.signals"),
-    ]
-):
-    from mavquad import config, wire
-    from mavquad.link import tlog
-    from tests.fuzz import targets
-
+from mavquad import autopilot_words, config, delayed, lifecycle, messages, pipeline, samples, strangers, toml, tunables, wire
 from mavquad.errors import ConfigError, LogError, WireError
+from mavquad.link import signals, tlog
 from mavquad.settings import Companion
+from tests.fuzz import targets
 
+_LED = (
+    wire,
+    tlog,
+    config,
+    toml,
+    pipeline,
+    messages,
+    lifecycle,
+    samples,
+    signals,
+    autopilot_words,
+    strangers,
+    delayed,
+    tunables,
+)
 _SCRATCH = Path(tempfile.mkdtemp())
 _TOML = _SCRATCH / "x.toml"
 STREAM, LOG, SETTINGS, PX4, ARDUPILOT = range(5)
@@ -63,6 +71,14 @@ def stream(data: bytes) -> None:
             assert frame.msgid not in wire.ID_SET
 
 
+def led() -> None:
+    """Watch which lines of these modules are reached: plain functions only, kernels are compiled from theirs."""
+    for module in _LED:
+        for thing in vars(module).values():
+            if isinstance(thing, types.FunctionType) and thing.__module__ == module.__name__:
+                atheris.instrument_func(thing)
+
+
 def seeds() -> Path:
     """A folder of good inputs to begin with: every message, pieces of a log, a settings file."""
     folder = _SCRATCH / "seeds"
@@ -81,5 +97,6 @@ def seeds() -> Path:
 
 
 if __name__ == "__main__":
+    led()
     atheris.Setup([*sys.argv, str(seeds())], one)
     atheris.Fuzz()
