@@ -114,5 +114,17 @@ def test_ratios_are_over_the_peers_own_figures(monkeypatch):
 
 def test_growth_says_how_cost_grows():
     rows = growth._table("a task", "ours", "things", [(1, 1.0), (2, 2.0), (4, 8.0)], "s")
-    assert [row.note for row in rows] == ["", "", "exponent 2.00"]
+    note = "exponent 2.00 between the last two; from the first to the last 2.3 s for each more"
+    assert [row.note for row in rows] == ["", "", note]
     assert rows[0].what == "a task, 1 things"
+
+
+def test_growth_measures_ours_against_every_size():
+    for rows, sizes, of in (
+        (growth.horizon(0.1), (10, 20, 40, 80), "steps of horizon"),
+        (growth.streams(0.1), (1, 4, 16, 64), "further streams"),
+        (growth.states(0.1)[:4], (6, 12, 24, 48), "states"),
+    ):
+        assert [row.what.split(", ")[-1] for row in rows] == [f"{n} {of}" for n in sizes]
+        assert all(row.value > 0.0 and row.who.startswith("ours") for row in rows)
+        assert "exponent" in rows[-1].note
