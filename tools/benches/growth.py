@@ -9,7 +9,7 @@ import math
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -133,7 +133,7 @@ def flights(seconds: float) -> list[Row]:
     return _table("compiled flights, one core", "ours", "flights", found, "s")
 
 
-def _in_turn(works: dict[int, Callable[[], object]], rounds: int) -> list[tuple[int, float]]:
+def _in_turn(works: Mapping[int, Callable[[], object]], rounds: int) -> list[tuple[int, float]]:
     """(size, median seconds of a call) for each size: all of them once to begin with, then round by round in turn."""
     spent: dict[int, list[float]] = {size: [] for size in works}
     for round_ in range(rounds + 1):
