@@ -7,7 +7,9 @@ from mavquad.jit import kernel
 
 
 @kernel
-def set_membership(gains: asmf.Gains, state: asmf.State, f: np.ndarray, drive: np.ndarray, y: np.ndarray, late: np.ndarray):
+def set_membership(
+    gains: asmf.Gains, state: asmf.State, f: np.ndarray, drive: np.ndarray, y: np.ndarray, late: np.ndarray
+) -> asmf.State:
     """The state after one predict and update for each row of y (k, m)."""
     for k in range(y.shape[0]):
         state = asmf.predict(gains, state, f, drive, 1.0, 20_000 * k)
