@@ -7,6 +7,7 @@ Each program ends with one line of JSON.
 import json
 import os
 import subprocess
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -77,9 +78,10 @@ def run(peer: str, program: str, *words: object) -> Any:
     python = home / "bin" / "python"
     if not python.exists():
         raise ConfigError(f"{peer} is not installed: `make bench` brings it (or name an environment in MAVQUAD_PEERS)")
-    command = [str(python), "-c", program, *map(str, words)]
+    command = [str(python.absolute()), "-c", program, *map(str, words)]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_LONGEST_S)
+        with tempfile.TemporaryDirectory() as folder:  # MuJoCo leaves a log where it runs
+            done = subprocess.run(command, capture_output=True, text=True, timeout=_LONGEST_S, cwd=folder)
     except subprocess.TimeoutExpired:
         raise ConfigError(f"{peer} gave no answer in {_LONGEST_S:.0f} s") from None
     if done.returncode:
