@@ -1,6 +1,10 @@
 """`make soak`: eighty minutes of vehicle time at ten times real time with faults, an independent listener between the programs.
 
 Memory stays flat, clocks do not drift, nothing unflyable is sent, and every frame the listener passed on is in one of the two logs.
+
+A tenth of a second is a second of this vehicle's time. Where the machine stands still for so long, companion and autopilot let go, as they
+should; a person would engage again, and so does the listener. A watch on every core says when the machine stood still, and
+the scheduler for how long the programs waited for a core: to let go without either is an error.
 """
 
 import argparse
@@ -18,7 +22,7 @@ from pathlib import Path
 
 import pytest
 
-from mavquad import wire
+from mavquad import lifecycle, wire
 from mavquad.link import tlog
 from mavquad.settings import Companion
 from tests.fuzz.targets import judge_outbox
@@ -28,6 +32,24 @@ MINUTES = float(os.environ.get("MAVQUAD_SOAK_MINUTES", "80"))
 SPEED = 10.0
 HEARTBEAT = wire.ID["HEARTBEAT"]
 SETPOINT = wire.ID["SET_ATTITUDE_TARGET"]
+STALL_S = 0.015  # what the watches tell
+HELD_UP_S, RECENT_S = (
+    0.03,
+    1.5,
+)  # for so long the programs were kept from running, so shortly before they let go: it is the reason
+ENGAGE, LAND = lifecycle.CMD_ENGAGE, lifecycle.CMD_LAND
+WATCH = f"""
+import os, sys, time
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, {{int(sys.argv[1])}})
+before = time.monotonic()
+while True:
+    time.sleep(0.001)
+    now = time.monotonic()
+    if now - before > {STALL_S}:
+        os.write(1, b"%.6f %.6f\\n" % (now, now - before))
+    before = now
+"""
 LINK = {"loss": 0.01, "duplicate": 0.005, "reorder": 0.005, "corrupt": 0.002, "jitter_ms": 5.0}
 
 
@@ -87,6 +109,12 @@ class Listener:
                 self.setpoints += 1
                 judge_outbox(Companion(), [(0, frame.raw)])
 
+    def ask(self, number):
+        """A request to the companion as a ground station behind the autopilot would send it; it is heard like all that is passed on."""
+        raw = wire.encode("COMMAND_LONG", (1, 191, number, 0, *(0.0,) * 7), seq=0, system=255, component=190)
+        self.down.add(raw)
+        self.front.sendto(raw, self.companion)
+
     def close(self):
         self.front.close()
         self.back.close()
@@ -111,6 +139,42 @@ def start(run, name, *words):
         module = "sitl" if name == "sitl" else "mavquad"
         command = [sys.executable, "-P", "-m", module, *map(str, words)]
         return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True)
+
+
+@contextlib.contextmanager
+def watches(path):
+    """A process on every core that writes down when it was not run for a while: (monotonic time, how long), one a line."""
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
+    with path.open("ab") as out:
+        running = [subprocess.Popen([sys.executable, "-c", WATCH, str(core)], stdout=out) for core in cores]
+        try:
+            yield
+        finally:
+            for one in running:
+                one.kill()
+                one.wait()
+
+
+def waited_s(*pids):
+    """For how long these processes could have run and were not let, since they began (Linux)."""
+    return sum(1e-9 * int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) for pid in pids)
+
+
+def told(path):
+    """(state, reason) as the companion said it last."""
+    states = [line.split("  ", 2)[-1].partition(": ") for line in path.read_text().splitlines()]
+    return next(
+        (
+            (state.split()[-1], why)
+            for state, _, why in reversed(states)
+            if state.split()[-1:] and state.split()[-1] in lifecycle.STATES
+        ),
+        ("", ""),
+    )
+
+
+def stalls(path):
+    return [tuple(map(float, line.split())) for line in path.read_text().splitlines()]
 
 
 def memory_kib(child):
@@ -145,7 +209,7 @@ def test_a_long_flight_with_faults_at_ten_times_real_time(tmp_path, capsys):
     length_s = 60.0 * MINUTES
     parser = argparse.ArgumentParser()
     fly.add_arguments(parser)
-    words = ["hover", "--set", f"path.duration_s={length_s}", "--set", f"flight.max_time_s={length_s + 120}"]
+    words = ["hover", "--set", f"path.duration_s={2 * length_s}", "--set", f"flight.max_time_s={length_s + 300}"]
     for name, value in LINK.items():
         words += ["--set", f"link.{name}={value}"]
     run = tmp_path / "run"
@@ -153,19 +217,32 @@ def test_a_long_flight_with_faults_at_ten_times_real_time(tmp_path, capsys):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
         sock.bind(("127.0.0.1", 0))
         port = sock.getsockname()[1]
-    end = ["--exit-when-landed", 2.0, "--max-time", length_s + 120.0]
+    end = ["--exit-when-landed", 2.0, "--max-time", length_s + 300.0]
     sitl = start(run, "sitl", "--config", run / "sitl.toml", "--endpoint", f"udpin:127.0.0.1:{port}", "--log", run / "sitl.tlog", "--speed", SPEED, *end)  # fmt: skip
     listener = Listener(port)
     there = f"udpout:127.0.0.1:{listener.front.getsockname()[1]}"
     companion = start(
         run, "companion", "--config", run / "companion.toml", "--endpoint", there, "--run", run, "--engage", "--speed", SPEED
     )
-    seen = []
+    seen, queued, released, landing = [], [], [], False
+    watched = contextlib.ExitStack()
+    watched.enter_context(watches(tmp_path / "stalls.txt"))
     try:
         while sitl.poll() is None and companion.poll() is None:
-            listener.serve(2.0)
+            listener.serve(0.2)
             with contextlib.suppress(OSError, IndexError):
                 seen.append((flight.vehicle_time_s(run / "flight.trace"), memory_kib(sitl), memory_kib(companion)))
+                queued.append((time.monotonic(), waited_s(sitl.pid, companion.pid, os.getpid())))
+            state, why = told(run / "companion.txt")
+            over = bool(seen) and seen[-1][0] > length_s
+            if state == lifecycle.RELEASED and not landing:
+                released.append((time.monotonic(), why))
+                listener.serve(1.0)
+                listener.ask(ENGAGE)
+                listener.serve(1.0)
+            elif state == lifecycle.ENGAGED and over and not landing:
+                landing = True
+                listener.ask(LAND)
     finally:
         for child in (companion, sitl):
             if child.poll() is None:
@@ -177,6 +254,7 @@ def test_a_long_flight_with_faults_at_ten_times_real_time(tmp_path, capsys):
                 child.kill()
         listener.serve(0.2)
         listener.close()
+        watched.close()
     said = (run / "companion.txt").read_text()
     report, summary = json.loads((run / "sitl.json").read_text()), json.loads((run / "companion.json").read_text())
     logged_down, logged_up = Tally(), Tally()
@@ -190,11 +268,21 @@ def test_a_long_flight_with_faults_at_ten_times_real_time(tmp_path, capsys):
         print(f"down: {listener.down} passed on, {logged_down} logged; up: {listener.up} passed on, {logged_up} logged")
         print(f"{listener.setpoints} setpoints judged; vehicle over logged time {rates[0]:.4f} then {rates[1]:.4f}")
         print(f"refused {summary['refused']}; counts {summary['counts']}")
+        stood = stalls(tmp_path / "stalls.txt")
+        print(f"a core stood still {len(stood)} times, {1e3 * max([0.0, *(long for _, long in stood)]):.0f} ms at most")
+        print(f"the programs waited {queued[-1][1]:.1f} s for a core")
+        print(f"let go and engaged again: {[why for _, why in released]}")
     assert "engaged" in said, said
     assert report["landed"], said
     assert not report["crashed"]
     assert report["sim_time_s"] > length_s
-    asked = 1  # the request to engage is logged, and never was on the wire
+    for noticed, why in released:
+        held_up_s = sum(long for ended, long in stood if noticed - RECENT_S < ended <= noticed)
+        waits = [wait for t, wait in queued if t <= noticed]
+        before = [wait for t, wait in queued if t <= noticed - RECENT_S]
+        held_up_s = max(held_up_s, waits[-1] - (before or waits)[-1])
+        assert held_up_s > HELD_UP_S, f"let go while the machine ran: {why}"
+    asked = 1  # the first request to engage is logged, and never was on the wire
     assert logged_down.frames - asked == listener.down.frames
     assert logged_up == listener.up
     assert listener.greetings <= 10
