@@ -71,7 +71,7 @@ LAYOUTS: dict[str, frames.Layout] = {
     "HIGHRES_IMU": ("clock_us", "accel:accel_m_s2", "gyro:gyro", "magnetometer_gauss", "barometer", 25.0, 0x1FFF, 0),
     "ATT_POS_MOCAP": ("mocap_us", "mocap:mocap_q_wxyz", "mocap:mocap_p_ned_m", _COVARIANCE),
     "LOCAL_POSITION_NED": ("clock_ms", "position:nav_p_ned_m", "position:nav_v_ned_m_s"),
-    "SERVO_OUTPUT_RAW": ("clock_us", 0, "pwm_us", _ZEROS_12),
+    "SERVO_OUTPUT_RAW": ("wrapped_us", 0, "pwm_us", _ZEROS_12),
     "ATTITUDE_TARGET": ("clock_ms", "type_mask", "echo_q_wxyz", "echo_rates_rad_s", "thrust"),
     "ATTITUDE": ("clock_ms", "attitude:ahrs_euler_rad", "attitude:rates_rad_s"),
     "ATTITUDE_QUATERNION": ("clock_ms", "attitude:ahrs_q_wxyz", "attitude:rates_rad_s", (0.0,) * 4),
@@ -98,6 +98,7 @@ def laid_out(sim: "Simulation", name: str) -> Callable[[], Fields]:
     v, msgid, read = sim.vehicle, wire.ID[name], sim.faults.read
     clocks: dict[str, Callable[[], int]] = {
         "clock_us": lambda: v.t_us - sim.autopilot.boot_us,
+        "wrapped_us": lambda: (v.t_us - sim.autopilot.boot_us) & 0xFFFFFFFF,
         "clock_ms": lambda: (v.t_us - sim.autopilot.boot_us) // 1000,
         "mocap_us": lambda: max(0, v.t_us - sim.autopilot.boot_us - sim.mocap_age_us),
     }

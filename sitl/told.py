@@ -18,6 +18,7 @@ TOLD = np.dtype(
         # of an instant
         ("clock_us", "i8"),  # since boot
         ("clock_ms", "i8"),
+        ("wrapped_us", "i8"),  # in 32 bits
         ("mocap_us", "i8"),
         ("type_mask", "i8"),  # of ATTITUDE_TARGET
         ("echo_q_wxyz", "f8", 4),
@@ -41,6 +42,7 @@ def tell(s, sp, a, t_us):
     """The clocks, and the attitude that the loop is after."""
     a.clock_us = t_us - a.booted_us
     a.clock_ms = a.clock_us // 1000
+    a.wrapped_us = a.clock_us & 0xFFFFFFFF
     a.mocap_us = max(0, a.clock_us - a.mocap_age_us)  # the first samples after the start are as old as that
     a.type_mask = 128 if sp.kind == RATES and a.echo != SHAPED else 0
     if a.echo != GIVEN:

@@ -46,6 +46,27 @@ def test_every_layout_is_what_its_builder_says(personality, rates):
     assert len(expected) == len(telemetry.LAYOUTS)
 
 
+def test_the_servos_stamp_wraps_in_32_bits_by_kernel_and_by_builder():
+    """After 71.6 minutes; a wire with faults has its frames made in Python."""
+    c = Client("link.delay_ms=0")
+    for name in c.link.streams:
+        c.sim.set_interval(c.link, name, c.sim.vehicle.dt_us if name in telemetry.LAYOUTS else -1)
+    c.sim.collect(c.link)
+    c.sim.autopilot.boot_us = c.sim.t_us - (1 << 32) + 3 * c.sim.vehicle.dt_us
+    c.sim._voice.booted(c.sim.autopilot)
+    stamps = []
+    for _ in range(6):
+        got, expected = spoken(c)
+        assert [frame.raw for frame in got] == expected
+        stamps += [wire.decode(frame).time_usec for frame in got if frame.msgid == wire.ID["SERVO_OUTPUT_RAW"]]
+    assert stamps[0] > stamps[-1] > 0
+    noisy = Client("link.loss=0.1", "link.jitter_ms=1")
+    noisy.sim.autopilot.boot_us = noisy.sim.t_us - (1 << 32) + 100_000
+    noisy.sim._voice.booted(noisy.sim.autopilot)
+    noisy.run(0.5)
+    assert noisy.last["SERVO_OUTPUT_RAW"].time_usec < 1_000_000
+
+
 def ring(**link):
     sitl = config.load(None, [f"link.{name}={value}" for name, value in link.items()])
     return Ring(sitl, frames.tables({"HEARTBEAT": None}, {}))
