@@ -163,7 +163,7 @@ def _tick(plan: Plan, f: Flight, now_us: int) -> None:
         elif age > safety.hold_s and f.sent is not None:
             control_step.hold(plan, f, 1e-6 * _TICK_US, level=age > safety.level_s)
         elif f.late_us and now_us - f.late_us > 500_000:
-            outbox.release(plan, f, "this companion is too late")
+            outbox.release(plan, f, f"this companion is too late, {f.late_s:.2f} s")
         _adapt(plan, f)
         _bounds(plan, f, p)
 

@@ -53,7 +53,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--loop", choices=("attitude", "rates"), help="what setpoints carry")
     parser.add_argument("--signing-key", default="", metavar="FILE", help="sign the whole flight with the key in FILE (0600)")
-    parser.add_argument("--speed", type=float, metavar="F", help="F times real time (default: lockstep, as fast as it goes)")
+    parser.add_argument(
+        "--speed",
+        type=float,
+        metavar="F",
+        help="F times real time, on a machine that keeps up: late by F times its own delays, the companion lets go (default: lockstep, as fast as it goes)",
+    )
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change anything; again for more")
     parser.add_argument("--run", type=Path, metavar="DIR", help="run folder (default: runs/<time>-<scenario>-<seed>)")
     parser.add_argument("--no-report", action="store_true", help="write no report.html")
@@ -95,11 +100,11 @@ def one(args: argparse.Namespace, folder: Path, forward: str = "") -> dict[str, 
         return summary.path_duration_s(resolved.companion)
 
     resolved = resolve(args)
-    flight.prepare(folder, resolved)
     max_time_s = resolved.scenario.flight.max_time_s
     signal.signal(signal.SIGTERM, _terminated)
     with Progress(path_s, quiet=args.json) as progress:
         warm.ensure(f"flight {stages(resolved.companion)}", lambda: warm.flight(resolved), progress.say)
+        flight.prepare(folder, resolved)
         flown = flight.fly(folder, flight.Pace(args.speed), max_time_s, progress.watch, forward)
         progress.say("scoring")
         from tools import summary
